@@ -54,13 +54,13 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[
 
 
 def read_table(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv, or an empty list if the file does not exist."""
-    try:
-        text = read_regular(out / INDICES_FILE).decode()
-        # Lines may have too few or too many cells.
-        return [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
-        return []
+    """Return the rows of OUT/indices.csv that can be read; none if the file does not exist."""
+    rows: list[IndexReport] = []
+    with suppress(OSError, csv.Error):
+        for line in csv.DictReader(io.StringIO(read_regular(out / INDICES_FILE).decode(errors="replace"))):
+            with suppress(ValueError, KeyError, TypeError, AttributeError):  # too few or too many cells
+                rows.append(_row(line, out))
+    return rows
 
 
 def refuse_foreign_table(folder: Path) -> None:
@@ -89,9 +89,8 @@ def update_table(
 
     Return all rows. An empty table is not written. Raises OutputError.
     """
-    old = read_table(out)
     result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
-    if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
+    if result or read_table(out):
         cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
         write_csv(out / INDICES_FILE, (*_OF_CAPTURE, *_OF_INDEX), cells)
     return result

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from agalign._version import __version__
 from agalign.config import WriteSettings
-from agalign.errors import ConfigurationError, InputError
+from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
@@ -168,7 +168,7 @@ class IndexRasters(Product):
         """Write the indices that were requested and of which the capture has all bands, usable, and those that an
         earlier command wrote.
 
-        Raises InputError if bands of a requested index are in the wrong unit, OutputError.
+        Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
         """
         base, label = context.paths.file(""), context.capture.label
         requested = [index_named(name) for name in context.settings.write.indices]
@@ -180,7 +180,7 @@ class IndexRasters(Product):
             if report.path is not None:
                 self._add_before(context, index, report)
                 yield from self._files(report.path)
-            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
+            elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
                 problems.append(f"{index.name}: {report.problem}")
         masked = list(_masked(bands, context))
         for raster in earlier:
@@ -260,9 +260,8 @@ def write_rasters(
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
-    band of an index is missing, not usable, not in the unit that the index needs, or not as the sidecar has `listed`
-    its file, the report has the problem.
-    Raises OutputError, or InputError for a file that cannot be read.
+    band of an index is missing, not usable, not in the unit that the index needs, not as the sidecar has `listed` its
+    file, or if a file cannot be read or written, the report has the problem.
     """
     listed = listed or ListedFiles()
     with BandReader(listed) as reader:
@@ -277,11 +276,10 @@ def write_rasters(
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and (file := _foreign_file(target)):
                     raise InputError(foreign(file, "folder"))
-                unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
-            except InputError as error:
+                statistics = earlier or _write(index, chosen, target, source, reader)
+            except (InputError, OutputError) as error:
                 yield IndexReport(label, index.name, problem=str(error))
                 continue
-            statistics = earlier or _write(index, chosen, target, unit, source, reader)
             is_masked = any(band.quality is not None for band in chosen)
             yield IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
 
@@ -410,9 +408,10 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
 
 
 def _write(
-    index: Index, bands: Sequence[AlignedBand], target: Path, unit: str, source: str, reader: BandReader
+    index: Index, bands: Sequence[AlignedBand], target: Path, source: str, reader: BandReader
 ) -> IndexStatistics:
     """Write the raster tile by tile, and its picture. Raises OutputError, InputError for a band."""
+    unit = _common_unit(index, bands, reader)
     like = reader.file(bands[0].file, bands[0].band_index)
     profile = geotiff.tiled_profile(like.width, like.height, 1, "float32", **geotiff.FLOAT_OPTIONS)
     if like.crs is not None and not like.transform.is_identity:

@@ -5,6 +5,7 @@ import shutil
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,15 +16,24 @@ from synthetic_flights.aligned import list_stack, make_aligned
 
 from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.errors import ConfigurationError, InputError
+from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.rasters.band_reader import RAW
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import read_sidecar, verify_outputs, write_sidecar
 from agalign.report.pages import write_pages
+from agalign.spectral_indices import rasters
 from agalign.spectral_indices.before_alignment import index_before
-from agalign.spectral_indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
+from agalign.spectral_indices.formulas import (
+    INDICES,
+    Index,
+    bands_for,
+    compute,
+    evaluate,
+    index_named,
+    index_of_formula,
+)
 from agalign.spectral_indices.indices_csv import read_table, update_table
 from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, write_rasters
 from agalign.values import geometry
@@ -215,14 +225,16 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     assert len(update_table(target, [])) == len(read_table(target)) == 3
 
 
-@pytest.mark.parametrize("line", [",,", "," * 40 + "x", "a\0b", "1,2,3", f"{'x' * 200_000},y"])
-def test_a_damaged_table_is_written_again(tmp_path: Path, line: str) -> None:
+@pytest.mark.parametrize("line", [b",,", b"," * 40 + b"x", b"a\0b", b"1,2,3", b"\xe9", b"x" * 200_000 + b",y"])
+def test_a_damaged_line_costs_only_its_own_row(tmp_path: Path, line: bytes) -> None:
     statistics = IndexStatistics(masked_share=0.25)
     update_table(tmp_path, [IndexReport("IMG_0001", "ndvi", None, statistics, "left out")])
-    assert [row.statistics.masked_share for row in read_table(tmp_path)] == [0.25]
     path = tmp_path / "indices.csv"
-    path.write_text(f"{path.read_text()}{line}\n")
-    assert read_table(tmp_path) == []
+    undamaged = path.read_bytes()
+    path.write_bytes(undamaged + line + b"\n")
+    assert [row.statistics.masked_share for row in read_table(tmp_path)] == [0.25]
+    update_table(tmp_path, [])
+    assert path.read_bytes() == undamaged
 
 
 def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
@@ -360,3 +372,21 @@ def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
     assert report.kept
     listed = read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products
     assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
+
+
+def test_an_index_that_cannot_be_written_does_not_cost_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_aligned(tmp_path, 1)
+    draw = rasters._draw
+
+    def draw_but_ndre(index: Index, *arguments: Any) -> None:
+        if index.name == "ndre":
+            raise OutputError("the disk is full")
+        draw(index, *arguments)
+
+    monkeypatch.setattr(rasters, "_draw", draw_but_ndre)
+    written, unwritten, last = indices_of(tmp_path, "ndvi", "ndre", "gndvi")
+    assert unwritten.problem == "the disk is full"
+    listed = [part.file for part in read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products]
+    assert [r.path.name in listed for r in (written, last)] == [True, True]
