@@ -37,9 +37,9 @@ from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
-from agalign.records.excluded import others_excluded
+from agalign.records.excluded import last_excluded
 from agalign.records.listed_files import states_of
-from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record
+from agalign.records.run_record import RunPart, begun, input_name, last_record
 from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages
 from agalign.report.panels_and_sky import panel_picture, write_panels, write_sky
@@ -268,7 +268,7 @@ class _FlightRun:
         """
         selection = select_captures(self.flight.captures, self.settings.write, self.options)
         for reading in selection.panels:
-            refuse_foreign(panel_picture(reading.capture, self.out))
+            refuse_foreign(panel_picture(reading.capture.label, self.out))
         for name in model_names(flights_of(selection.captures)) if self.settings.learns_flights else ():
             refuse_foreign(self.out / MODELS_FOLDER / name)
         return selection
@@ -302,14 +302,18 @@ class _FlightRun:
         """Write the records of the sky and of the panels, and keep those of other inputs; yield the captures that are
         not aligned, with reports.
         """
-        earlier_panels, earlier_sky = others_excluded(self.out, record.other_inputs)
-        for excluded, facts in zip(sky, write_sky(sky, self.out, earlier_sky), strict=True):
-            record.excluded.append(excluded_part(excluded.capture, "sky", facts.cues))
-            yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence), excluded.capture
-        for reading, part in zip(panels, write_panels(panels, self.out, earlier_panels), strict=True):
-            if reading.capture.is_of_a_panel:
-                record.excluded.append(excluded_part(reading.capture, "panel", part.cues))
-                yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture
+        others = {label for labels in record.other_inputs.values() for label in labels}
+        earlier_panels, earlier_sky = last_excluded(self.out)
+        parts_of_sky = write_sky(sky, self.out, [part for part in earlier_sky if part.label in others])
+        parts_of_panels = write_panels(panels, self.out, [part for part in earlier_panels if part.label in others])
+        gone = {part.label for part in earlier_panels} - others.union(part.label for part in parts_of_panels)
+        pictures = (panel_picture(label, self.out) for label in gone)
+        output_files.remove_files([path for path in pictures if output_files.is_removed(path, {})], self.out)
+        for excluded, part in zip(sky, parts_of_sky, strict=True):
+            yield CaptureReport(part.label, "sky", sky=part.sentence), excluded.capture
+        for reading, panel in zip(panels, parts_of_panels, strict=True):
+            if panel.is_left_out:
+                yield CaptureReport(panel.label, "panel", panel=panel.sentence), reading.capture
 
     def _aligned(self, captures: Sequence[Capture], record: RunPart) -> Iterator[CaptureReport]:
         """Learn the model of each flight, keep finished captures and process the others; yield their reports as they

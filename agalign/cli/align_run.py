@@ -23,6 +23,7 @@ from agalign.flight.groups import camera_overviews
 from agalign.host.files import REPORT_FILE
 from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
+from agalign.records.excluded import exclusions, last_excluded
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import read_without_tables
@@ -105,7 +106,9 @@ class RunTotals:
     is_complete: bool
     """All captures are good, no file has a problem, and the report is written."""
     asked: dict[str, int] = field(default_factory=dict)
-    """Number of band pairs of each capture that is to be aligned."""
+    """Number of band pairs of each capture."""
+    excluded: set[str] = field(default_factory=set)
+    """Labels of the captures that are not aligned, as they show a panel or the sky."""
     states: Counter[str] = field(default_factory=Counter)
     """Number of captures by state."""
     written: dict[str, tuple[str, Path]] = field(default_factory=dict)
@@ -128,7 +131,7 @@ class RunTotals:
         for path, reason in report.removed:
             self.removed[reason].append(path)
         if report.state in ("panel", "sky"):
-            self.asked.pop(report.label, None)
+            self.excluded.add(report.label)
         if report.result is None:
             return
         self.pairs.add(report.label, report.result)
@@ -338,9 +341,10 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     _print_totals(totals, terminal)
     for reason, paths in totals.removed.items():
         terminal.problem(f"{counted(len(paths), 'file')} of an earlier command removed, such as {paths[0]}: {reason}")
-    record = read_run_record(out)
-    for line in [] if record is None else record.exclusions():
+    panels, sky = last_excluded(out)
+    for line in exclusions(part for part in (*panels, *sky) if part.label in totals.excluded):
         terminal.result(line)
+    record = read_run_record(out)
     for line in [] if record is None else record.notes_on_input():
         terminal.problem(f"{out}: {line}")
     if totals.has_report:
@@ -359,7 +363,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
 
 def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
     statuses, written = totals.pairs.statuses, totals.pairs.captures
-    unfinished = [pairs for label, pairs in totals.asked.items() if label not in written]
+    unfinished = [pairs for label, pairs in totals.asked.items() if label not in written | totals.excluded]
     asked, lost = statuses.total() + sum(unfinished), len(unfinished)
     if statuses:
         missing = f"; {counted(lost, 'capture')} not written" if lost else ""

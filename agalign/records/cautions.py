@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign.errors import InputError, SidecarError
+from agalign.errors import InputError
 from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
 from agalign.flight.rig_file import model_fingerprint
 from agalign.host.files import MODELS_FOLDER
-from agalign.records.excluded import PanelPart, read_excluded
+from agalign.records.excluded import PanelPart, last_excluded
 from agalign.records.run_record import last_record
 from agalign.records.sidecar import BandRadiometryPart, BandResult, Sidecar
 from agalign.values import remedies
@@ -82,10 +82,7 @@ class RunFacts:
     @classmethod
     def of(cls, out: Path) -> "RunFacts":
         """Read the facts of a run; files that cannot be read are left out."""
-        panels: list[PanelPart] = []
-        models, record = set(), last_record(out)
-        with suppress(SidecarError):
-            panels = read_excluded(out)[0]
+        models, record, (panels, _) = set(), last_record(out), last_excluded(out)
         for path in (out / MODELS_FOLDER).glob("*.safetensors"):
             with suppress(InputError):
                 models.add(model_fingerprint(path))

@@ -1,14 +1,17 @@
 """Captures of calibration panels and of the sky: OUT/panels.json and OUT/sky.json."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, SKY_FILE, read_model
-from agalign.values.capture import PanelSource
+from agalign.host.text import counted
+from agalign.values.capture import CameraIdentity, PanelSource, Pose, Position
 from agalign.values.fields import Message, Name, SourceFile
 
 
@@ -47,10 +50,22 @@ class SkyBandPart(_Part):
     """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
 
 
-class _CapturePart(_Part):
+class ExcludedPart(_Part):
+    """A capture of a panel or of the sky."""
+
+    kind: ClassVar[str]
+    """What the capture shows, as its status in tables and maps."""
     folder: str
     capture: str
     captured_at: Name
+    camera: CameraIdentity = CameraIdentity()
+    position: Position | None = None
+    pose: Pose | None = None
+    footprint: list[tuple[float, float]] | None = None
+    """Longitude and latitude, degrees, of the corners of the image."""
+    footprint_accuracy_m: float | None = None
+    cues: list[Name] = []
+    """Independent evidence for what the capture shows, in words."""
 
     @property
     def label(self) -> str:
@@ -63,16 +78,15 @@ class _CapturePart(_Part):
         return True
 
 
-class PanelPart(_CapturePart):
+class PanelPart(ExcludedPart):
     """One capture of a panel."""
 
+    kind = "panel"
     seen_by: PanelSource
     serial: Name
     picture: str
     in_scene: bool = False
     """The capture shows a scene that contains the panel, or only one cue indicates it: it is aligned."""
-    cues: list[Name] = []
-    """Evidence that the capture shows a panel, in words."""
     sensor_scale: float | None = None
     """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
     fits_sensor: bool = True
@@ -129,11 +143,10 @@ class PanelPart(_CapturePart):
         return text
 
 
-class SkyPart(_CapturePart):
+class SkyPart(ExcludedPart):
     """One capture of the sky."""
 
-    cues: list[Name]
-    """Evidence that the capture shows the sky, in words."""
+    kind = "sky"
     bands: list[SkyBandPart]
 
     @property
@@ -169,13 +182,20 @@ def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
     return ([] if panels is None else panels.panels), ([] if sky is None else sky.captures)
 
 
-def others_excluded(out: Path, other_inputs: Mapping[str, Sequence[str]]) -> tuple[list[PanelPart], list[SkyPart]]:
-    """Return the captures of panels and of the sky that earlier runs found in other input folders, given the labels of
-    the captures there; none if the files cannot be read.
-    """
-    labels = {label for several in other_inputs.values() for label in several}
-    try:
-        panels, sky = read_excluded(out)
-    except SidecarError:
-        return [], []
-    return [one for one in panels if one.label in labels], [one for one in sky if one.label in labels]
+def last_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
+    """Return the captures as `read_excluded`; none if a file cannot be read, which the commands that need it name."""
+    with suppress(SidecarError):
+        return read_excluded(out)
+    return [], []
+
+
+def exclusions(parts: Iterable[ExcludedPart]) -> list[str]:
+    """Return a line for each kind of captures that are not aligned: their number, and that of those with each cue."""
+    lines, left_out = [], [part for part in parts if part.is_left_out]
+    for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
+        of_kind = [part for part in left_out if part.kind == kind]
+        counts = Counter(cue for part in of_kind for cue in part.cues)
+        if of_kind:
+            evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
+            lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
+    return lines

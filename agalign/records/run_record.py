@@ -15,17 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.flight.footprint import accuracy_of_footprint_m, footprint
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.host.files import RUN_FILE, read_model, read_regular, write_model
 from agalign.host.libraries import library_versions
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted, escape_controls, shortened
-from agalign.records.excluded import PanelPart, SkyPart
+from agalign.records.excluded import ExcludedPart
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import label_of
-from agalign.values.capture import CameraIdentity, Capture, Pose, Position
-from agalign.values.image import OutputGrid
+from agalign.values.capture import Capture
 
 _SCHEMA = "agalign-run/2"
 RunState = Literal["running", "interrupted", "finished"]
@@ -60,22 +58,6 @@ class NotInInputPart(_Part):
     """Capture of the input with the same exposure, whose result counts instead; empty if there is none."""
 
 
-class ExclusionPart(_Part):
-    """A capture that is not aligned because of what it shows."""
-
-    capture: str
-    kind: Literal["panel", "sky"]
-    evidence: list[str]
-    """Independent cues, in words: at least two."""
-    captured_at: str = ""
-    camera: CameraIdentity = CameraIdentity()
-    position: Position | None = None
-    pose: Pose | None = None
-    footprint: list[tuple[float, float]] | None = None
-    """Longitude and latitude, degrees, of the corners of the image."""
-    footprint_accuracy_m: float | None = None
-
-
 class RunPart(_Part):
     """Record of one run. A run that was killed leaves the state `running`."""
 
@@ -108,7 +90,6 @@ class RunPart(_Part):
     """Processing time by capture."""
     refused: list[RefusalPart] = []
     problems: list[ProblemPart] = []
-    excluded: list[ExclusionPart] = []
     other_inputs: dict[str, list[str]] = {}
     """Labels of captures that earlier runs found in other input folders, by folder."""
     not_in_input: list[NotInInputPart] = []
@@ -141,17 +122,6 @@ class RunPart(_Part):
         """Add a problem of a file or capture; characters that are not printable are escaped."""
         self.problems.append(ProblemPart(of=escape_controls(what), problem=escape_controls(text)))
 
-    def exclusions(self) -> list[str]:
-        """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
-        lines = []
-        for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
-            of_kind = [part for part in self.excluded if part.kind == kind]
-            counts = Counter(cue for part in of_kind for cue in part.evidence)
-            if of_kind:
-                evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
-                lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
-        return lines
-
     def notes_on_input(self) -> list[str]:
         """Return a line about the results of captures that the input no longer has, and one about renamed captures."""
         gone = [part.capture for part in self.not_in_input if not part.same_as]
@@ -174,7 +144,7 @@ class RunPart(_Part):
 
     def has_same_results(self, earlier: "RunPart") -> bool:
         """Return True if the pages of an earlier run are true of this one, if the results have not changed."""
-        names = "settings", "labels", "problems", "excluded", "not_in_input"
+        names = "settings", "labels", "problems", "not_in_input"
         return earlier.state == "finished" and all(getattr(self, name) == getattr(earlier, name) for name in names)
 
     def write(self, out: Path, state: RunState, seconds: float) -> None:
@@ -183,25 +153,6 @@ class RunPart(_Part):
         for name in ("stage_seconds", "capture_seconds"):
             facts[name] = {k: round(v, 3) for k, v in sorted(getattr(self, name).items())}
         write_model(out / RUN_FILE, self.model_copy(update=facts))
-
-
-def excluded_part(capture: Capture, kind: Literal["panel", "sky"], evidence: list[str]) -> ExclusionPart:
-    """Return the record of a capture that is not aligned.
-
-    Its footprint is for a known height only: panels are photographed from 1 m, and the sky is not on the ground.
-    """
-    ring = footprint(capture, OutputGrid(0, 0, *capture.reference.size_px))
-    return ExclusionPart(
-        capture=capture.label,
-        kind=kind,
-        evidence=evidence,
-        captured_at=capture.known_time,
-        camera=capture.camera,
-        position=capture.position,
-        pose=capture.pose,
-        footprint=None if ring is None else [(x, y) for x, y in ring[::-1].tolist()],
-        footprint_accuracy_m=None if ring is None else accuracy_of_footprint_m(capture),
-    )
 
 
 def input_name(folder: Path) -> str:
@@ -317,16 +268,14 @@ def _named(labels: Sequence[str]) -> str:
 
 
 def unfinished_run(
-    record: RunPart | None, not_aligned: Iterable[PanelPart | SkyPart], labels: Collection[str]
+    record: RunPart | None, not_aligned: Iterable[ExcludedPart], labels: Collection[str]
 ) -> UnfinishedRun | None:
     """Return what the last run into a folder did not do, given its panels and captures of the sky, and the labels of
     the captures that have a result; None without a record.
     """
     if record is None:
         return None
-    excluded = {part.capture for part in record.excluded}
-    # A killed run has written these files, and not the end of its record.
-    excluded |= {part.label for part in not_aligned if part.is_left_out}
+    excluded = {part.label for part in not_aligned if part.is_left_out}
     wanted = [label for label in record.labels if label not in excluded]
     with_problem = {part.of for part in record.problems}
     missing = [label for label in wanted if label not in labels]

@@ -252,13 +252,11 @@ class FlightFacts:
         self._first_lattice += len(lattices)
         self._lattices = {}
 
-    def add_excluded(self, panels: Sequence[PanelPart], sky: Sequence[SkyPart]) -> None:
-        """Add the bands of captures that were not aligned, as they show a panel or the sky."""
-        not_aligned = [("panel", part) for part in panels if part.is_left_out] + [("sky", part) for part in sky]
-        for status, part in not_aligned:
-            row = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-            for band in part.bands:
-                self._summary.add(row | {"band": band.band})
+    def add_excluded(self, part: PanelPart | SkyPart) -> None:
+        """Add the bands of a capture that is not aligned, as it shows a panel or the sky."""
+        row = {"folder": part.folder, "capture": part.capture, "status": part.kind, "reason": part.sentence}
+        for band in part.bands:
+            self._summary.add(row | {"band": band.band})
 
     def add_without_result(self, labels: Sequence[str]) -> None:
         """Add the captures of the run that have no sidecar."""

@@ -1,6 +1,6 @@
 """OUT/flight.geojson: the footprints of the captures of a run, with their results and links to their files.
 
-It is a view of the sidecars, and of the captures in the record of the run that are not aligned.
+It is a view of the sidecars, and of the captures of panels and of the sky that are not aligned.
 """
 
 import json
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.host.files import FLIGHT_MAP_FILE, write_text
-from agalign.records.run_record import ExclusionPart
+from agalign.records.excluded import ExcludedPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.summary_csv import rounded
 from agalign.spectral_indices.rasters import IndexReport
@@ -59,14 +59,12 @@ class FlightMap:
             },
         )
 
-    def add_excluded(self, part: ExclusionPart) -> None:
+    def add_excluded(self, part: ExcludedPart) -> None:
         """Add a capture that is not aligned, as it shows a panel or the sky."""
         facts = _place(part.camera, part.captured_at, part.position, part.pose)
         shape = geojson_geometry(part.footprint, part.position)
-        accuracy_m = part.footprint_accuracy_m
-        self._features[part.capture] = _feature(
-            part.capture, shape, {"status": part.kind, **facts, "accuracy_m": accuracy_m, "indices": []}
-        )
+        facts |= {"status": part.kind, "accuracy_m": part.footprint_accuracy_m, "indices": []}
+        self._features[part.label] = _feature(part.label, shape, facts)
 
     def add_indices(self, rows: Iterable[IndexReport], out: Path) -> None:
         """Link the rasters of an index table, of files below `out`, of captures that were added before."""

@@ -19,7 +19,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
-from agalign.records.excluded import PanelPart, SkyPart, read_excluded
+from agalign.records.excluded import PanelPart, SkyPart, exclusions, read_excluded
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
@@ -55,12 +55,13 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         (panels, sky), run = read_excluded(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    facts.add_excluded(panels, sky)
-    unfinished = unfinished_run(run, (*panels, *sky), facts.seconds)
+    excluded: list[PanelPart | SkyPart] = [*(one for one in panels if one.is_left_out), *sky]
+    for one in excluded:
+        facts.add_excluded(one)
+        flight_map.add_excluded(one)
+    unfinished = unfinished_run(run, excluded, facts.seconds)
     facts.add_without_result([] if unfinished is None else unfinished.missing)
     facts.write()
-    for one in [] if run is None else run.excluded:
-        flight_map.add_excluded(one)
     flight_map.add_indices(rows, out)
     flight_map.write(out)
     page = _page(
@@ -74,6 +75,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         drifts=drifts_of(facts.cameras),
         panels=panels,
         sky=sky,
+        exclusions=exclusions(excluded),
     )
     write_text(out / REPORT_FILE, page)
     remove_other_data_files(out, facts.files)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from agalign.errors import AgalignError
+from agalign.flight.footprint import accuracy_of_footprint_m, footprint
 from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.host.files import PANELS_FILE, SKY_FILE, check_inside, write_model
@@ -16,12 +17,13 @@ from agalign.pixels.raster import read_preview
 from agalign.rasters.drawing import Picture, side_by_side, titled, write_png
 from agalign.records.excluded import PanelPart, PanelsFile, SkyFile, SkyPart
 from agalign.values.capture import Band, Capture, source_file
+from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
 
-def panel_picture(capture: Capture, out: Path) -> Path:
+def panel_picture(label: str, out: Path) -> Path:
     """Return the path of the picture of a panel. Raises OutputError for a link that leads out of the folder."""
-    return check_inside(out / capture.folder, out) / f"{capture.name}.panel.png"
+    return check_inside(out / f"{label}.panel.png", out)
 
 
 def write_panels(readings: Sequence[PanelReading], out: Path, others: Sequence[PanelPart] = ()) -> list[PanelPart]:
@@ -31,7 +33,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path, others: Sequence[P
     """
     parts = []
     for reading in readings:
-        picture = panel_picture(reading.capture, out)
+        picture = panel_picture(reading.capture.label, out)
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, scales = reading.panel, reading.sensor_scales
         bands = [_panel_band(b, reading.capture) | {"sensor_scale": scales.get(b.band.name)} for b in reading.bands]
@@ -61,7 +63,20 @@ def write_sky(sky: Sequence[SkyCapture], out: Path, others: Sequence[SkyPart] = 
 
 
 def _identity(capture: Capture) -> dict[str, Any]:
-    return {"folder": capture.folder.as_posix(), "capture": capture.name, "captured_at": capture.known_time}
+    """The facts about a capture. Its footprint is for a known height only: panels are photographed from 1 m, and the
+    sky is not on the ground.
+    """
+    ring = footprint(capture, OutputGrid(0, 0, *capture.reference.size_px))
+    return {
+        "folder": capture.folder.as_posix(),
+        "capture": capture.name,
+        "captured_at": capture.known_time,
+        "camera": capture.camera,
+        "position": capture.position,
+        "pose": capture.pose,
+        "footprint": None if ring is None else [(x, y) for x, y in ring[::-1].tolist()],
+        "footprint_accuracy_m": None if ring is None else accuracy_of_footprint_m(capture),
+    }
 
 
 def _panel_band(reading: BandReading, capture: Capture) -> dict[str, Any]:

@@ -78,7 +78,9 @@ def test_a_run_on_another_folder_keeps_the_panels_of_the_first(between_panels: P
             shutil.copyfile(path, folder / path.name)
         agalign.align_folder(folder, out, settings=seeded("rig"))
         panels, _ = read_excluded(out)
-        assert [panel.label for panel in panels] == ([] if day == "day 1 again" else ["IMG_0001"])
+        names = [] if day == "day 1 again" else ["IMG_0001"]
+        assert [panel.label for panel in panels] == names
+        assert [path.name for path in out.rglob("*.panel.png")] == [f"{name}.panel.png" for name in names]
 
 
 @pytest.mark.slow
@@ -101,9 +103,9 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     assert "Calibration panels" in page
     assert "IMG_0001.panel.png" in page
     assert last.sentence in unescape(page)
-    excluded = read_json(by_panel / "agalign-run.json")["excluded"]
-    assert [part["capture"] for part in excluded] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0004"]
-    assert excluded[0]["evidence"][:2] == ["a QR code", "a homogeneous square in most bands"]
+    assert first.cues[:2] == ["a QR code", "a homogeneous square in most bands"]
+    places = {f["id"]: f["properties"]["status"] for f in read_json(by_panel / "flight.geojson")["features"]}
+    assert [places[part.label] for part in (first, last)] == ["panel", "panel"]
     assert "Left out: 2 captures of a calibration panel, by a QR code (2), a homogeneous square" in unescape(page)
 
 

@@ -26,7 +26,7 @@ from agalign.flight.footprint import (
     with_approximate_georeference,
     with_assumed_height,
 )
-from agalign.records.run_record import excluded_part
+from agalign.records.excluded import SkyPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.flight_map import FlightMap, geojson_geometry
 from agalign.report.pages import write_pages
@@ -151,7 +151,7 @@ def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_pat
     on_map.add("one", sidecar_of(replace(capture(None), position=None)))
     assert on_map.write(tmp_path) is None
     assert not list(tmp_path.iterdir())
-    on_map.add_excluded(excluded_part(replace(capture(None), name="b"), "sky", ["blue", "bright"]))
+    on_map.add_excluded(SkyPart(folder="one", capture="b", captured_at="", position=capture(None).position, bands=[]))
     path = on_map.write(tmp_path)
     first, second = json.loads(path.read_text())["features"]
     assert (first["id"], first["geometry"]) == ("one/a", None)
