@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from operator import index
 from pathlib import Path
@@ -382,20 +383,19 @@ def _run(
     progress: Progress | None = None,
     start: Path | None = None,
 ) -> FlightReports:
-    from agalign.report.pages import write_pages
-
     reports = FlightReports()
-    for report in run_flight(flight, out, settings, run, Listener(on_again=_LOG.info), start):
-        if report.state in ("panel", "sky"):  # before the others
-            reports.excluded.append(report)
-            _LOG.info("%s: %s", report.label, report.summary)
-            continue
-        reports.append(report)
-        captures = len(flight.captures) - len(reports.excluded)
-        _LOG.info("%d of %d: %s: %s", len(reports), captures, report.label, report.summary)
-        if progress is not None:
-            progress(report, len(reports), captures)
-    write_pages(out, _LOG.warning)
+    listener = Listener(on_again=_LOG.info, on_problem=_LOG.warning)
+    with closing(run_flight(flight, out, settings, run, listener, start)) as finished:
+        for report in finished:
+            if report.state in ("panel", "sky"):  # before the others
+                reports.excluded.append(report)
+                _LOG.info("%s: %s", report.label, report.summary)
+                continue
+            reports.append(report)
+            captures = len(flight.captures) - len(reports.excluded)
+            _LOG.info("%d of %d: %s: %s", len(reports), captures, report.label, report.summary)
+            if progress is not None:
+                progress(report, len(reports), captures)
     return reports
 
 
@@ -411,7 +411,7 @@ def indices(
 ) -> list[IndexReport]:
     """Compute spectral indices of the aligned captures of a run, and write a raster and a picture of each.
 
-    The table indices.csv has a row for each capture and index.
+    The table indices.csv has a row for each capture and index. Next to the stacks of a run, its report is updated.
 
     Parameters
     ----------
@@ -456,7 +456,8 @@ def indices(
     chosen = chosen_indices(names, formulas)
     tasks = index_tasks(Path(out), chosen, folder, overwrite=options.overwrite, mask_qa=mask_qa)
     with locked(folder):
-        return [report for done in run_indices(tasks, options.jobs, options.executor) for report in done]
+        done = run_indices(tasks, options.jobs, options.executor, _LOG.warning)
+        return [report for of_capture in done for report in of_capture]
 
 
 @checked

@@ -1,15 +1,16 @@
 """Spectral indices of all captures of a run: serially, in processes of this machine, or on an executor."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 
+from agalign.batch.capture_task import quiet
 from agalign.batch.workers import failure_text, numbers_of_workers, open_workers, serially
 from agalign.errors import AgalignError
-from agalign.host.files import written_below
+from agalign.host.files import REPORT_FILE, written_below
 from agalign.host.processes import usable_cores
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
@@ -63,14 +64,18 @@ def index_tasks(
 
 
 def run_indices(
-    tasks: Sequence[IndexTask], jobs: int = 0, executor: Executor | None = None
+    tasks: Sequence[IndexTask],
+    jobs: int = 0,
+    executor: Executor | None = None,
+    on_problem: Callable[[str], object] = quiet,
 ) -> Iterator[list[IndexReport]]:
-    """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv.
+    """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv, and the
+    pages of the run if they are in the same folder. Files that are not in the pages are reported to `on_problem`.
 
     `jobs` is the number of processes, each for one capture at a time; 0 is one per core. An `executor` processes the
     captures instead; its workers need the same folders.
     A failed capture is reported and does not stop the others. Raises WorkerError if no worker process can be started,
-    and OutputError if the table cannot be written.
+    and OutputError if the table or the pages cannot be written.
     """
     # Starting a process takes as long as the indices of eight captures.
     processes, _ = numbers_of_workers(len(tasks), jobs or usable_cores(), worth_a_process=8)
@@ -88,7 +93,12 @@ def run_indices(
                 yield reports
     finally:
         if rows:  # also after an interruption
-            update_table(tasks[0].target, rows)
+            out, target = tasks[0].out, tasks[0].target
+            update_table(target, rows)
+            if target == out and (out / REPORT_FILE).is_file():
+                from agalign.report.pages import write_pages  # workers do not need it
+
+                write_pages(out, on_problem)
 
 
 def do_indices(task: IndexTask) -> list[IndexReport]:

@@ -1,8 +1,9 @@
 """A run over many captures: select those to process, learn the model of each flight, process them."""
 
+import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -39,9 +40,9 @@ from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
 from agalign.records.excluded import last_excluded
 from agalign.records.listed_files import states_of
-from agalign.records.run_record import RunPart, begun, input_name, last_record
+from agalign.records.run_record import Finished, RunPart, RunState, begun, input_name, last_record
 from agalign.records.sidecar import FilePart
-from agalign.report.pages import outdate_pages
+from agalign.report.pages import outdate_pages, pages_exist, write_pages
 from agalign.report.panels_and_sky import panel_picture, write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture
@@ -73,6 +74,8 @@ class Listener:
     """Camera of the network that was learned, and the seconds that it took."""
     on_again: Callable[[str], object] = quiet
     """How many finished captures are estimated or rendered again, and why; called before any is replaced."""
+    on_problem: Callable[[str], object] = quiet
+    """Why a file is not in the pages, which are written at the end of the run."""
     on_lost: Callable[[str], object] = quiet
     """Label of a capture whose files were removed after it was reported; called at the end of the run."""
 
@@ -84,7 +87,7 @@ def run_flight(
     options: RunOptions | None = None,
     listener: Listener | None = None,
     model: Path | None = None,
-) -> Iterator[CaptureReport]:
+) -> Generator[CaptureReport, None, None]:
     """Align the captures and yield the report of each; captures finished by an earlier run are kept, or rendered again
     if only settings of the output have changed.
 
@@ -108,38 +111,42 @@ def run_flight(
 def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureReport]:
     """Process the captures of a run, record it, and yield the report of each capture. Raises as `run_flight`."""
     out = run.out
-    # (path of the sidecar, its files, state, statuses of the pairs) by label; sidecars would not fit into memory.
-    written: dict[str, tuple[Path, Sequence[FilePart], str, list[str]]] = {}
-    gone: list[str] = []
+    finished: dict[str, Finished] = {}
+    gone, again = list[str](), "the same command writes them again"
     began = saved = time.monotonic()
     with _recorded(run) as record:
         try:
             for report in run.reports(selection, record):
-                record.add(report.label, report.state, report.result, report.problems)
+                finished[report.label] = Finished(report.state)
+                for text in report.problems:
+                    record.add_problem(report.label, text)
                 if report.state == "done":
                     record.capture_seconds[report.label] = report.seconds
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
-                    statuses = [status for _, status, _ in report.result.pairs]
                     here = earlier_results.existing_files(report.path, report.result)
-                    written[report.label] = report.path, here, report.state, statuses
+                    finished[report.label] = Finished(report.state, report.result.pairs, report.path, here)
                     record.file_states[report.label] = run.file_states(report, report.path.parent, here)
                 if time.monotonic() - saved > _SAVED_EVERY_S:  # for the case that the run is killed
                     saved = time.monotonic()
+                    record.count(finished)
                     record.write(out, "running", saved - began)
                 yield report
                 if report.problems and is_full(out):
                     raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
         finally:
-            for label, (path, files, state, statuses) in written.items():
-                if not earlier_results.outputs_exist(path, files):
+            for label, one in finished.items():
+                if one.sidecar is not None and not earlier_results.outputs_exist(one.sidecar, one.files):
                     gone.append(label)
-                    record.retract(label, state, statuses)
+                    finished[label] = Finished("error")
+                    record.capture_seconds.pop(label, None)
+                    record.add_problem(label, f"its files were removed during the run; {again}")
                     run.listener.on_lost(label)
+            record.count(finished)
         if gone:
             what = f"outputs of {counted(len(gone), 'capture')} were removed during the run, such as of {gone[0]}"
-            raise OutputError(f"{out}: {what}; the same command writes them again")
+            raise OutputError(f"{out}: {what}; {again}")
 
 
 def plan_run(
@@ -166,7 +173,7 @@ def plan_run(
 
 @contextmanager
 def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
-    """Write the run record at the beginning and at the end of a run, also after an interruption."""
+    """Write the run record at the beginning of a run, and with the pages at its end, also after an interruption."""
     began, earlier = time.monotonic(), last_record(run.out)
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
     record.file_states = {} if earlier is None else dict(earlier.file_states)
@@ -179,11 +186,9 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
         yield record
     except BaseException:
         with suppress(OutputError):
-            record.end(run.out, "interrupted", time.monotonic() - began, earlier)
+            run.end(record, "interrupted", time.monotonic() - began, earlier)
         raise
-    record.end(run.out, "finished", time.monotonic() - began, earlier)
-    if earlier is not None and not record.has_same_results(earlier):
-        outdate_pages(run.out)
+    run.end(record, "finished", time.monotonic() - began, earlier)
 
 
 @dataclass
@@ -347,6 +352,22 @@ class _FlightRun:
             for message in plan.changes():
                 self.listener.on_again(message)
             yield from capture_reports(run_tasks, tasks, self.listener, timeout_s)
+
+    def end(self, record: RunPart, state: RunState, seconds: float, earlier: RunPart | None) -> None:
+        """Write the record, given that of the run before, and the pages unless they have the same results already.
+
+        Raises OutputError.
+        """
+        is_kept = record.captures.keys() <= {"found", "kept"}
+        if not is_kept or (earlier is not None and not record.has_same_results(earlier)):
+            outdate_pages(self.out)
+        record.end(self.out, state, seconds, earlier)
+        try:
+            if not pages_exist(self.out):
+                write_pages(self.out, self.listener.on_problem)
+        except MemoryError:
+            text = f"{self.out}: the report does not fit into memory; 'agalign report {self.out}' writes it elsewhere"
+            logging.getLogger(__name__).warning(text)
 
     def _plan(self, captures: Sequence[Capture]) -> "_Plan":
         """Compare the captures with the results of earlier runs."""

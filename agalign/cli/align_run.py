@@ -8,7 +8,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -26,9 +26,8 @@ from agalign.records.cautions import RunFacts
 from agalign.records.excluded import exclusions, last_excluded
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar import BandResult
-from agalign.records.sidecar_file import read_without_tables
+from agalign.records.sidecar_file import read_sidecar
 from agalign.report.facts import PairTotals
-from agalign.report.pages import pages_exist, write_pages
 from agalign.report.summary_csv import rounded
 from agalign.values.capture import Capture
 
@@ -113,12 +112,8 @@ class RunTotals:
     """Number of captures by state."""
     written: dict[str, tuple[str, Path]] = field(default_factory=dict)
     """State and sidecar of each capture with a result, by label."""
-    lost: list[str] = field(default_factory=list)
-    """Labels of captures whose files were removed during the run."""
     pairs: PairTotals = field(default_factory=PairTotals)
-    """The pairs of captures with a result."""
-    has_report: bool = False
-    """The report is written."""
+    """The pairs of captures with a result, after `count`."""
     removed: dict[str, list[Path]] = field(default_factory=lambda: defaultdict(list))
     """Files of earlier commands that were removed, by reason."""
     panel_ages_s: dict[str, list[float | None]] = field(default_factory=lambda: defaultdict(list))
@@ -132,25 +127,24 @@ class RunTotals:
             self.removed[reason].append(path)
         if report.state in ("panel", "sky"):
             self.excluded.add(report.label)
-        if report.result is None:
+        if report.result is None or report.path is None:
             return
-        self.pairs.add(report.label, report.result)
-        if report.path is not None:
-            self.written[report.label] = report.state, report.path
+        self.written[report.label] = report.state, report.path
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
 
-    def recount(self) -> None:
-        """Count captures whose files were removed as errors, without their pairs, as the record of the run does."""
-        for label in (one for one in self.lost if one in self.written):
-            state, _ = self.written.pop(label)
-            self.states.subtract([state])
-            self.states["error"] += 1
-        self.states, self.pairs = +self.states, PairTotals(self.pairs.run)  # without zeros
-        for label, (_, path) in self.written.items():
+    def lose(self, label: str) -> None:
+        """Count a capture whose files were removed during the run as an error."""
+        if (written := self.written.pop(label, None)) is not None:
+            self.states = +(self.states + Counter(error=1) - Counter([written[0]]))
+
+    def count(self, out: Path) -> None:
+        """Count the pairs in the sidecars of the run, in the order of the report."""
+        self.pairs = PairTotals(RunFacts.of(out))
+        for label, (_, path) in sorted(self.written.items(), key=lambda one: one[1][1]):
             with suppress(SidecarError):  # the report names it
-                self.pairs.add(label, read_without_tables(path))
+                self.pairs.add(label, read_sidecar(path))
 
 
 def run(
@@ -170,7 +164,7 @@ def run(
     from agalign.batch.run import run_flight
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
-    totals, started = RunTotals(flight.is_complete, asked), time.monotonic()
+    totals, problems, started = RunTotals(flight.is_complete, asked), list[str](), time.monotonic()
     with cluster(dask, options.jobs) as executor, progress(terminal, len(flight.captures)) as show_line:
         options = replace(options, executor=executor)
 
@@ -178,25 +172,22 @@ def run(
             skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
             show_line(totals.states.total() + share, text, skipped)
 
-        listener = replace(_listener(terminal, show), on_lost=totals.lost.append)
+        listener = replace(_listener(terminal, show), on_problem=problems.append, on_lost=totals.lose)
         try:
-            for report in run_flight(flight, out, settings, options, listener, model):
-                terminal.check()
-                if not totals.written:  # panels and models are written before the first result
-                    totals.pairs.run = RunFacts.of(out)
-                totals.add(report)
-                show(0.0, report.label)
-                _print_report(report, terminal, totals.states.total(), len(flight.captures))
+            with closing(run_flight(flight, out, settings, options, listener, model)) as reports:
+                for report in reports:
+                    terminal.check()
+                    totals.add(report)
+                    show(0.0, report.label)
+                    _print_report(report, terminal, totals.states.total(), len(flight.captures))
         except (OutputError, WorkerError) as error:
             if not totals.states:
                 raise
-            terminal.problem(str(error))
-            totals.is_complete = False
-            totals.recount()
-        finally:
-            # Also after an interruption.
-            if totals.states:
-                _write_pages(out, terminal, totals)
+            problems.append(str(error))
+    for problem in problems:
+        terminal.problem(problem)
+    totals.is_complete &= not problems
+    totals.count(out)
     seconds = round(time.monotonic() - started, 1)
     terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)
     return totals
@@ -222,24 +213,6 @@ def _listener(terminal: Terminal, show: Callable[[float, str], None]) -> "Listen
         on_learned=lambda camera, seconds: terminal.event("learned", camera=camera, seconds=round(seconds, 2)),
         on_again=lambda text: terminal.event("again", text, message=text),
     )
-
-
-def _write_pages(out: Path, terminal: Terminal, totals: RunTotals) -> None:
-    """Write report and summary. The run is not complete if that fails, or if a sidecar cannot be read; it is if only
-    the memory is too small for the report, which can be written later.
-    """
-    problems: list[str] = []
-    try:
-        if set(totals.states) != {"kept"} or not pages_exist(out):
-            write_pages(out, problems.append)
-        totals.has_report = True
-    except OutputError as error:
-        problems.append(str(error))
-    except MemoryError:
-        terminal.problem(f"{out}: the report does not fit into memory; 'agalign report {out}' writes it elsewhere")
-    for problem in problems:
-        terminal.problem(problem)
-    totals.is_complete &= not problems
 
 
 def cluster(dask: str | None, jobs: int) -> AbstractContextManager[Executor | None]:
@@ -347,7 +320,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     record = read_run_record(out)
     for line in [] if record is None else record.notes_on_input():
         terminal.problem(f"{out}: {line}")
-    if totals.has_report:
+    if (out / REPORT_FILE).is_file():
         terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:
         or_sky = " or the sky" if totals.states["sky"] else ""

@@ -166,7 +166,6 @@ def _indices(
     from agalign.cli.align_run import cluster, progress
     from agalign.errors import OutputError
     from agalign.host.output_folder import locked
-    from agalign.report.pages import write_pages
     from agalign.spectral_indices.formulas import chosen_indices
 
     names = (index or ("" if formula else "ndvi")).split(",")
@@ -178,12 +177,10 @@ def _indices(
     reports: list[IndexReport] = []
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         try:
-            for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
+            for number, done in enumerate(run_indices(tasks, jobs, executor, terminal.problem), start=1):
                 _print_capture(done, reports, terminal)
                 reports += done
                 show(number, done[0].capture, 0)
-            if target is None and (out / REPORT_FILE).is_file():
-                write_pages(out, terminal.problem)
         except OutputError as error:  # of the table or the report: the rasters and their statistics exist
             unwritten = str(error)
     is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)

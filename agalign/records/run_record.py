@@ -3,7 +3,7 @@
 import json
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,7 +21,7 @@ from agalign.host.libraries import library_versions
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted, escape_controls, shortened
 from agalign.records.excluded import ExcludedPart
-from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import label_of
 from agalign.values.capture import Capture
 
@@ -48,6 +48,18 @@ class ProblemPart(_Part):
 
     of: str
     problem: str
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a run keeps of the report of a capture; the sidecars of a season would not fit into memory."""
+
+    state: str
+    pairs: Sequence[tuple[str, str, str | None]] = ()
+    """As `Sidecar.pairs`."""
+    sidecar: Path | None = None
+    files: Sequence[FilePart] = ()
+    """Those of the sidecar that exist."""
 
 
 class NotInInputPart(_Part):
@@ -96,27 +108,16 @@ class RunPart(_Part):
     file_states: dict[str, str] = {}
     """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
-    def add(self, label: str, state: str, result: Sidecar | None, problems: Iterable[str]) -> None:
-        """Add the result of a capture."""
-        self.captures[state] += 1
-        for text in problems:
-            self.add_problem(label, text)
-        for band, status, reason in [] if result is None else result.pairs:
-            self.pairs[status] += 1
-            if status != "aligned":
-                self.refused.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
-
-    def retract(self, label: str, state: str, statuses: Iterable[str]) -> None:
-        """Count a capture that was added with this state, and these statuses of its pairs, as an error, because its
-        files do not exist.
-        """
-        self.captures[state] -= 1
-        self.captures["error"] += 1
-        self.pairs.subtract(statuses)
-        self.captures, self.pairs = +self.captures, +self.pairs  # without zeros
-        self.refused = [part for part in self.refused if part.capture != label]
-        self.capture_seconds.pop(label, None)
-        self.add_problem(label, "its files were removed during the run; the same command writes them again")
+    def count(self, finished: Mapping[str, Finished]) -> None:
+        """Count the captures that are finished, given by label, and their band pairs."""
+        pairs = [(label, *pair) for label, one in finished.items() for pair in one.pairs]
+        self.captures = Counter(found=len(self.labels)) + Counter(one.state for one in finished.values())
+        self.pairs = Counter(status for _, _, status, _ in pairs)
+        self.refused = [
+            RefusalPart(capture=label, band=band, status=status, reason=reason)
+            for label, band, status, reason in pairs
+            if status != "aligned"
+        ]
 
     def add_problem(self, what: str, text: str) -> None:
         """Add a problem of a file or capture; characters that are not printable are escaped."""
@@ -174,7 +175,6 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         machine={**system, "cores": usable_cores(), "device": settings.joint.device},
         settings=settings.model_dump(mode="json"),
         labels=[capture.label for capture in captures],
-        captures=Counter(found=len(captures)),
     )
 
 

@@ -49,7 +49,7 @@ class DriftChart:
     """Labels of the first and the last capture."""
 
 
-def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, Any]]:
+def rig_views(out: Path, on_problem: Callable[[str], object]) -> list[dict[str, Any]]:
     """Return the rigs of the models below OUT/models; unreadable models are reported to `on_problem`.
 
     Each has `camera`, number of `captures`, `shared` factors in words, `field_height`, the `reference` band with

@@ -38,7 +38,7 @@ _MAX_EXCLUDED = 20
 """Captures of panels, and of the sky, with a table in the page; OUT/panels.json and OUT/sky.json have all."""
 
 
-def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
+def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     """Write OUT/index.html with OUT/report-data, OUT/summary.csv, OUT/indices.csv and OUT/flight.geojson from all
     sidecars below OUT, and return their data.
 
@@ -87,7 +87,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
 
 
 def _add_captures(
-    out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], None]
+    out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], object]
 ) -> list[IndexReport]:
     """Add all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows."""
     earlier = current_rows(out)

@@ -24,9 +24,11 @@ from agalign.cli import align_run, main
 from agalign.cli.align_run import RunTotals, conclude, print_problems
 from agalign.cli.command import Command, help_of
 from agalign.cli.terminal import Terminal, exits
+from agalign.config import RunOptions
 from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
+from agalign.records.sidecar_file import write_sidecar
 
-from ..conftest import raising, write_capture
+from ..conftest import raising, seeded, write_capture
 from ..program import agalign_here
 from ..records.test_sidecar import NIR, example
 
@@ -302,14 +304,16 @@ def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[s
     ],
 )
 def test_the_age_of_a_panel_is_printed_and_warned_of(
-    radiometry: str, age_s: float | None, text: str, capsys: pytest.CaptureFixture[str]
+    radiometry: str, age_s: float | None, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
     totals = RunTotals(True)
     few_saturated = NIR | {"reason": None, "saturated": 0.001}
     sidecar = example(output=output | {"panel_age_s": age_s}, bands=[few_saturated])
-    totals.add(CaptureReport("IMG_1", "done", sidecar))
-    conclude(totals, Path("out"), Terminal())
+    totals.add(CaptureReport("IMG_1", "done", sidecar, tmp_path / "IMG_1.json"))
+    write_sidecar(tmp_path / "IMG_1.json", sidecar)
+    totals.count(tmp_path)
+    conclude(totals, tmp_path, Terminal())
     printed = capsys.readouterr()
     assert f"Written as {radiometry}: {text}" in printed.out.splitlines()
     assert "saturated" not in printed.err
@@ -318,16 +322,22 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     assert is_warned == (radiometry == "reflectance by panel" and age_s == 3180.0)
 
 
-def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_totals_count_missing_bands_and_captures_without_a_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of a disk that is full after the third of four captures, which shows a panel."""
     totals = RunTotals(False, {f"IMG_{number}": 2 for number in range(4)})
     blue = {"band": "Blue", "file": "b.tif", "band_index": 1, "width": 10, "height": 8}
     aligned = NIR | {"status": "aligned", "reason": None}
-    complete = example(bands=[aligned | {"saturated": 0.031}, aligned | {"band": "Red"}])
-    totals.add(CaptureReport("IMG_0", "done", complete))
-    totals.add(CaptureReport("IMG_1", "done", example(bands=[aligned], missing_bands=["Green"], reference=blue)))
+    complete = example(capture="IMG_0", bands=[aligned | {"saturated": 0.031}, aligned | {"band": "Red"}])
+    other = example(bands=[aligned], missing_bands=["Green"], reference=blue)
+    for name, sidecar in (("IMG_1", other), ("IMG_0", complete)):  # in the order in which they finish
+        path = tmp_path / f"{name}.json"
+        totals.add(CaptureReport(name, "done", write_sidecar(path, sidecar), path))
     totals.add(CaptureReport("IMG_2", "panel", panel="a calibration panel"))
-    assert conclude(totals, Path("out"), Terminal()) == 3
+    totals.count(tmp_path)
+    assert [label for label, *_ in totals.pairs._references] == ["IMG_0", "IMG_1"], "that of the report"
+    assert conclude(totals, tmp_path, Terminal()) == 3
     printed = capsys.readouterr()
     assert "3 of 6 band pairs aligned; 1 capture not written" in printed.out
     assert re.search(r"^│ Green +│ +0 │ +0 │ +0 │ +0 │ +1 │ +- │ +- │ +- │$", printed.out, re.MULTILINE)
@@ -362,23 +372,24 @@ def test_a_signal_during_an_import_ends_the_command_after_it() -> None:
     ],
 )
 def test_a_report_that_cannot_be_written_is_not_announced(
+    flight: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
     error: Exception,
     is_complete: bool,
     said: str,
 ) -> None:
     """Where only the memory is too small for the report, the run is complete."""
-    monkeypatch.setattr(align_run, "write_pages", raising(error))
-    totals = RunTotals(is_complete=True)
-    totals.add(CaptureReport("a", "done", example(), tmp_path / "a.json"))
-    align_run._write_pages(tmp_path, Terminal(), totals)
+    monkeypatch.setattr("agalign.batch.run.write_pages", raising(error))
+    totals = align_run.run(discover(flight), tmp_path, seeded("rig"), Terminal(), RunOptions())
     conclude(totals, tmp_path, Terminal())
     printed = capsys.readouterr()
-    assert said in printed.err
+    assert said in printed.err + caplog.text
     assert "Report:" not in printed.out
-    assert totals.is_complete == is_complete
+    assert totals.states == {"done": 2}
+    assert (said in printed.err) != is_complete
 
 
 def test_the_system_ends_the_program_at_the_interrupt_key_while_modules_are_imported(

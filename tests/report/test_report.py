@@ -32,7 +32,7 @@ from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 
-from ..conftest import read_json, save_known_model, textured_image
+from ..conftest import read_json, save_known_model, seeded, textured_image
 from ..records.test_sidecar import ALIGNED, NIR, example
 from ..run_outputs import change, table_in
 
@@ -625,3 +625,19 @@ def test_captures_with_another_reference_than_most_of_their_flight_are_named(ref
             groups[0].bands[0].reason
             == f"on the grid of {names[odd[0]]}; most captures of the flight are on that of {usual}"
         )
+
+
+def test_a_run_from_python_that_is_stopped_writes_its_pages(flight: Path, tmp_path: Path) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        agalign.align_folder(flight, tmp_path, settings=seeded("rig"), progress=stop)
+    assert "THE RUN WAS STOPPED" in (tmp_path / "index.html").read_text().upper()
+    assert pages_exist(tmp_path)
+
+
+def test_indices_from_python_are_in_the_report(out: Path) -> None:
+    agalign.indices(out)
+    assert [i["name"] for i in facts_of(out)["details"]["records"][0]["indices"]] == ["ndvi"]
+    assert "IMG_0001_ndvi.tif" in (out / "flight.geojson").read_text()
