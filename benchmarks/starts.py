@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from peers import elastix, sift
 
 import agalign
+from agalign.cameras.base import rotation
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import read_for_alignment
 from agalign.synthetic import flight as synthetic
-from agalign.synthetic.cameras import rotation
 from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster

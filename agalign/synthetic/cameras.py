@@ -8,12 +8,12 @@ from functools import cache
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import cv2
 import numpy as np
 import tifffile
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from numpy.typing import NDArray
 
+from agalign.cameras.base import rotation
 from agalign.cameras.tiff_directory import Directory, Entry, add_directories, byte_string, rational, short, text
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
@@ -162,14 +162,6 @@ def place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tupl
     flown = band.delay_s * np.array([*pose.velocity_m_s, 0.0])
     place = attitude @ np.array([*band.baseline_m, 0.0]) + flown + (pose.east_m, pose.north_m, -pose.altitude_m)
     return place, rays
-
-
-def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
-    """Return the product of the rotations about x, y and z by these angles."""
-    rotations = [
-        cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)
-    ]
-    return np.asarray(rotations[0] @ rotations[1] @ rotations[2], np.float64)
 
 
 class MicaSenseCamera(CameraSpec):

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from agalign.cameras.base import rotation
 from agalign.cameras.tiff_directory import rational
 from agalign.synthetic import cameras
-from agalign.synthetic.cameras import BandSpec, CameraSpec, Exposure, MicaSenseCamera, rotation, write_tiff
+from agalign.synthetic.cameras import BandSpec, CameraSpec, Exposure, MicaSenseCamera, write_tiff
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 
