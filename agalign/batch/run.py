@@ -117,16 +117,16 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
     with _recorded(run) as record:
         try:
             for report in run.reports(selection, record):
-                finished[report.label] = Finished(report.state)
+                finished[report.label] = Finished(report.state, seconds=report.seconds)
                 for text in report.problems:
                     record.add_problem(report.label, text)
-                if report.state == "done":
-                    record.capture_seconds[report.label] = report.seconds
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
                     here = earlier_results.existing_files(report.path, report.result)
-                    finished[report.label] = Finished(report.state, report.result.pairs, report.path, here)
+                    finished[report.label] = Finished(
+                        report.state, report.result.pairs, report.path, here, report.seconds
+                    )
                     record.file_states[report.label] = run.file_states(report, report.path.parent, here)
                 if time.monotonic() - saved > _SAVED_EVERY_S:  # for the case that the run is killed
                     saved = time.monotonic()
@@ -140,7 +140,6 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                 if one.sidecar is not None and not earlier_results.outputs_exist(one.sidecar, one.files):
                     gone.append(label)
                     finished[label] = Finished("error")
-                    record.capture_seconds.pop(label, None)
                     record.add_problem(label, f"its files were removed during the run; {again}")
                     run.listener.on_lost(label)
             record.count(finished)

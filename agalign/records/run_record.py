@@ -60,6 +60,7 @@ class Finished:
     sidecar: Path | None = None
     files: Sequence[FilePart] = ()
     """Those of the sidecar that exist."""
+    seconds: float = 0.0
 
 
 class NotInInputPart(_Part):
@@ -113,6 +114,7 @@ class RunPart(_Part):
         pairs = [(label, *pair) for label, one in finished.items() for pair in one.pairs]
         self.captures = Counter(found=len(self.labels)) + Counter(one.state for one in finished.values())
         self.pairs = Counter(status for _, _, status, _ in pairs)
+        self.capture_seconds = {label: one.seconds for label, one in finished.items() if one.state == "done"}
         self.refused = [
             RefusalPart(capture=label, band=band, status=status, reason=reason)
             for label, band, status, reason in pairs
