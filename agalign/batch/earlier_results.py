@@ -163,16 +163,11 @@ def _to_render(
     differing = results.changed_files(capture.label, path.parent, earlier.files if is_finished else parallax)
     if parallax and parallax[0] in differing:
         return Remaining("estimate", ("the parallax file",))
-    if any(part.kind != "index" or _is_index_raster(part, path) for part in differing):
+    # Only `agalign indices` restores an index raster that is missing or unreadable, and its picture.
+    readable = {raster.path.stem for raster in (index_rasters(path.with_suffix("")) if differing else [])}
+    if any(part.kind != "index" or Path(part.file).stem in readable for part in differing):
         return Remaining("render", ("files that are not as they were written",), earlier)
     return Remaining("nothing" if is_finished else "render", changed, earlier)
-
-
-def _is_index_raster(part: FilePart, sidecar: Path) -> bool:
-    """Return True for an index raster, or its picture, that rendering writes again: only `agalign indices` restores one
-    that is missing or unreadable.
-    """
-    return Path(part.file).stem in {raster.path.stem for raster in index_rasters(sidecar.with_suffix(""))}
 
 
 def _compared_files(earlier: Sidecar, capture: Capture) -> tuple[bool, list[str]]:
@@ -242,13 +237,6 @@ def _has_indices(earlier: Sidecar, names: Sequence[str]) -> bool:
     files = {part.file for part in earlier.products if part.kind == "index"}
     requested = (earlier.options or {}).get("write", {}).get("indices", [])
     return all(name in requested or f"{earlier.capture}_{name}.tif" in files for name in names)
-
-
-def existing_files(sidecar: Path, result: Sidecar) -> list[FilePart]:
-    """Return the files of a sidecar that exist. A finished capture may lack an index raster, which only `agalign
-    indices` restores.
-    """
-    return [part for part in result.files if outputs_exist(sidecar, [part])]
 
 
 def outputs_exist(sidecar: Path, files: Sequence[FilePart]) -> bool:

@@ -123,7 +123,8 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
-                    here = earlier_results.existing_files(report.path, report.result)
+                    # A finished capture may lack an index raster, which only `agalign indices` restores.
+                    here = [p for p in report.result.files if earlier_results.outputs_exist(report.path, [p])]
                     finished[report.label] = Finished(
                         report.state, report.result.pairs, report.path, here, report.seconds
                     )

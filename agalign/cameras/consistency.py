@@ -23,7 +23,7 @@ from agalign.cameras.sun import Sun, sun_position
 from agalign.host.text import counted, some_of
 from agalign.values.capture import MIN_APART_S, Band, Capture, Position, distance_km, known_time_s
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
-from agalign.values.spectrum import band_key, contradicts
+from agalign.values.spectrum import band_key, contradicts, with_wavelength
 
 _SAME_NM = 0.5
 """Between the wavelengths of two bands that are called equal."""
@@ -89,8 +89,11 @@ def with_position(tags: Tags, other: Position | None, by_tags: Sun | None) -> tu
         return replace(tags, position=None), Doubt(text, advice)
     if other is not None:
         return replace(tags, position=other), None
-    if tags.without_signs is not None:
-        fitting = [one for one in _in_hemispheres(tags.without_signs) if _fits_sun(one, tags.captured_at, by_tags)]
+    if (at := tags.without_signs) is not None:
+        is_known = by_tags is not None and known_time_s(tags.captured_at) is not None
+        signs = product((1, -1), repeat=2) if is_known else ()
+        places = [replace(at, latitude=at.latitude * a, longitude=at.longitude * b) for a, b in signs]
+        fitting = [place for place in places if not clock_error(place, tags.captured_at, by_tags)]
         if len(fitting) == 1:
             text = f"its GPS tags lack N or S, or E or W: by the sun it is at {fitting[0].text}"
             return replace(tags, position=fitting[0]), Doubt(text, "the position is used: check it")
@@ -98,17 +101,6 @@ def with_position(tags: Tags, other: Position | None, by_tags: Sun | None) -> tu
     if tags.position_to_a_minute is not None:
         return tags, Doubt("the seconds of its GPS position are not numbers", advice)
     return tags, None
-
-
-def _in_hemispheres(position: Position) -> list[Position]:
-    signs = product((1, -1), repeat=2)
-    return [replace(position, latitude=position.latitude * a, longitude=position.longitude * b) for a, b in signs]
-
-
-def _fits_sun(position: Position, captured_at: str, by_tags: Sun | None) -> bool:
-    """True if the sun of the tags is that of a position and time; False if one of them is unknown."""
-    is_known = by_tags is not None and known_time_s(captured_at) is not None
-    return is_known and not clock_error(position, captured_at, by_tags)
 
 
 # ---- size of the image and of the camera
@@ -260,7 +252,8 @@ def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
         for file in (f for f in group if len(f.bands) == 1 and f.tags.text(NAMESPACE, "BandName")):
             if file.tags.unread is None and (position := _position(file)):
                 serial = file.tags.serial or str(file.camera.capture_folder(file.path))
-                tags[file.tags.make, file.tags.model, serial, position][_label(file.bands[0])].append(file)
+                label = with_wavelength(file.bands[0].name, file.bands[0].wavelength_nm)
+                tags[file.tags.make, file.tags.model, serial, position][label].append(file)
         for text, path in _doubtful([b for file in group for b in file.bands if not b.is_from_photograph]):
             doubtful[text].append(path)
     texts = [(p[0], f"{text}, in {counted(len(p), 'file')}; correct the tags") for text, p in doubtful.items()]
@@ -310,10 +303,6 @@ def _doubtful(bands: Sequence[Band]) -> list[tuple[str, Path]]:
             text = f"the bands {one.name} and {other.name} of a capture have one wavelength, {nm:g} nm"
             result.append((text, other.path))
     return result
-
-
-def _label(band: Band) -> str:
-    return band.name if band.wavelength_nm is None else f"{band.name} ({band.wavelength_nm:g} nm)"
 
 
 def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:

@@ -19,6 +19,7 @@ from agalign.records.listed_files import ListedFiles
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.radiometry import MAX_REFLECTANCE
+from agalign.values.spectrum import with_wavelength
 
 RAW = "raw numbers"
 """Unit of bands that are neither reflectance nor radiance."""
@@ -115,11 +116,8 @@ def contents_of(capture: RunCapture) -> tuple[str, str]:
         for band in bands:
             names[reader.quantity(band) or RAW].append(band.name)
     quantities = [q if len(names) == 1 else f"{q} in {', '.join(names[q])}" for q in names]
-    return f"bands {', '.join(_named(band) for band in bands)}", " and ".join(quantities)
-
-
-def _named(band: AlignedBand) -> str:
-    return band.name if band.wavelength_nm is None else f"{band.name} ({band.wavelength_nm:g} nm)"
+    named = [with_wavelength(band.name, band.wavelength_nm) for band in bands]
+    return f"bands {', '.join(named)}", " and ".join(quantities)
 
 
 def like_most(captures: Sequence[RunCapture]) -> tuple[list[RunCapture], LeftOut]:

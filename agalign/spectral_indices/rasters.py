@@ -3,7 +3,6 @@
 """
 
 import glob
-import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError, OutputError
+from agalign.flight.fingerprint import hashed
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
@@ -369,8 +369,8 @@ def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
     """Sixteen hexadecimal digits of everything that an index raster depends on."""
     sources = [(b.sha256, b.band_index) for b in bands]
     masks = [(b.quality[2], b.quality[1]) for b in bands if b.quality is not None]
-    facts = json.dumps([__version__, index.formula, index.constants, index.span, sources, *([masks] if masks else [])])
-    return hashlib.sha256(facts.encode()).hexdigest()[:16]
+    facts = __version__, index.formula, index.constants, index.span, sources
+    return hashed(*facts, masks) if masks else hashed(*facts)
 
 
 def _finished_before(target: Path, source: str, listed: ListedFiles) -> IndexStatistics | None:

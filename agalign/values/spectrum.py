@@ -37,6 +37,11 @@ def band_key(name: str) -> str:
     return re.sub(r"[\s_-]", "", name).lower()
 
 
+def with_wavelength(name: str, wavelength_nm: float | None) -> str:
+    """Return the name of a band, with its wavelength if that is known, for a message."""
+    return name if wavelength_nm is None else f"{name} ({wavelength_nm:g} nm)"
+
+
 def role_of(name: str, wavelength_nm: float | None) -> Role | None:
     """Return the role of a band by its wavelength if that is known, else by its name; None for a band without one, and
     for a band with a name that contradicts its wavelength.
