@@ -73,7 +73,7 @@ def context_of(
     known = tuple(b for b in capture.bands if b is capture.reference or b.name in alignments)
     part = replace(capture, bands=known, reference_index=known.index(capture.reference))
     sidecar = Sidecar.estimated(part, alignments, settings)
-    return ProductContext(capture, paths, settings, sidecar, alignments, layers, grid, 0)
+    return ProductContext(capture, paths, settings, sidecar, alignments, layers, grid)
 
 
 def table_in(path: Path) -> list[dict[str, str]]:

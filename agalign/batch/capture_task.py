@@ -14,7 +14,7 @@ from typing import Any
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.output_files import earlier_result, is_removed, refuse_to_overwrite
 from agalign.batch.products import PRODUCTS
-from agalign.batch.render import RenderOptions, render
+from agalign.batch.render import render
 from agalign.batch.workers import failure_text
 from agalign.cameras.metadata import exposed_after_s
 from agalign.capture.align_bands import PairProgress, align_capture_bands
@@ -29,7 +29,7 @@ from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.radiometry import with_checked_pixels
 from agalign.pixels.raster import ReadTile, with_missing_parts, with_saturation_values
 from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
-from agalign.rasters.product import CapturePaths
+from agalign.rasters.product import CapturePaths, RenderOptions
 from agalign.rasters.read_alignment import alignments_of
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import file_part, read_with_change, write_sidecar

@@ -93,12 +93,11 @@ def run_indices(
                 yield reports
     finally:
         if rows:  # also after an interruption
-            out, target = tasks[0].out, tasks[0].target
-            update_table(target, rows)
-            if target == out and (out / REPORT_FILE).is_file():
-                from agalign.report.pages import write_pages  # workers do not need it
+            update_table(tasks[0].target, rows)
+    if rows and (out := tasks[0].out) == tasks[0].target and (out / REPORT_FILE).is_file():
+        from agalign.report.pages import write_pages  # workers do not need it
 
-                write_pages(out, on_problem)
+        write_pages(out, on_problem)
 
 
 def do_indices(task: IndexTask) -> list[IndexReport]:

@@ -7,7 +7,7 @@ One that cannot be written any more is removed, and the report of the capture na
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,8 @@ from agalign.flight.footprint import accuracy_of_footprint_m, footprint, with_as
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.aligned_files import BandFiles, Stack
 from agalign.rasters.alignment_maps import ReliefMap, moved_share, share_over_1_px
-from agalign.rasters.output_grid import FlightLimits, output_layers
-from agalign.rasters.preview import preview_bytes
-from agalign.rasters.product import CapturePaths, ProductContext
+from agalign.rasters.output_grid import output_layers
+from agalign.rasters.product import CapturePaths, ProductContext, RenderOptions
 from agalign.records.sidecar import (
     BandRadiometryPart,
     BandResult,
@@ -49,18 +48,6 @@ _ADDED = {product.option: product.kind for product in PRODUCTS if product.option
 """Settings that add files or layers, and the kind of product that shows that these exist."""
 _FOOTPRINT_DECIMALS = 7
 """Of degrees: a centimetre."""
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """What the rasters of a capture share with those of its flight."""
-
-    max_preview_bytes: int = preview_bytes(1)
-    """About the largest size of the preview."""
-    limits: FlightLimits = ()
-    """Limits of the flights of the camera."""
-    common: OutputGrid | None = None
-    """Grid of the captures of the camera, if they share one."""
 
 
 def with_earlier_products(settings: WriteSettings, sidecar: Sidecar) -> WriteSettings:
@@ -95,9 +82,7 @@ def render(
     if sidecar.rendered_with:  # a run that is killed now must render again
         sidecar = write_sidecar(paths.sidecar, sidecar.model_copy(update={"rendered_with": ""}))
     whole = OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(
-        capture, paths, settings, sidecar, alignments, (), whole, options.max_preview_bytes, options.limits, read=read
-    )
+    context = ProductContext(capture, paths, settings, sidecar, alignments, (), whole, options, read=read)
     if context.with_pixels:
         layers, grid = output_layers(capture, context.with_pixels, write, options.common, read)
         ties = tie_windows(capture, settings.seed, alignments, read) if write.tie_points else {}

@@ -16,7 +16,6 @@ from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
 from agalign.batch.earlier_results import EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
-from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
 from agalign.cameras.discover import FolderScan
@@ -36,8 +35,7 @@ from agalign.host.processes import usable_cores
 from agalign.host.text import counted, name_problem
 from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
-from agalign.rasters.preview import preview_bytes
-from agalign.rasters.product import CapturePaths
+from agalign.rasters.product import CapturePaths, RenderOptions
 from agalign.records.excluded import last_excluded
 from agalign.records.listed_files import states_of
 from agalign.records.run_record import Finished, RunPart, RunState, begun, input_name, last_record
@@ -400,14 +398,13 @@ class _FlightRun:
         """Yield each capture with the model of its flight and how it is rendered; with another crop, it is again."""
         flights = list(flights)
         crops = _crops_of_cameras(flights, plan.grids, self.settings.write)
-        max_bytes = preview_bytes(len(self.flight.captures))
         for group, model in flights:
             for capture in group:
                 limits, common = crops[_crop_key(capture)]
                 is_finished = plan.left[capture.label].step == "nothing"
                 if is_finished and common is not None and plan.grids.get(capture.label) not in (None, common):
                     plan.left[capture.label] = Remaining("render", ("crop of the flight",))
-                yield capture, model, RenderOptions(max_bytes, limits, common)
+                yield capture, model, RenderOptions(len(self.flight.captures), limits, common)
 
     def _kept(self, capture: Capture, left: Remaining) -> CaptureReport:
         """Return the report of a capture that this run does not process."""

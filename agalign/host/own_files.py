@@ -65,10 +65,8 @@ def refuse_to_replace(path: Path, mark: bytes | None) -> None:
     """Raise ConfigurationError if a file exists that a command would replace, unless it is one of an earlier command:
     that has a `mark` near its start. None refuses every file.
     """
-    with suppress(OSError):
-        start = b""
-        if path.is_file():
-            with path.open("rb") as file:
-                start = file.read(256)
-        if path.exists() and (mark is None or mark not in start):
-            raise ConfigurationError(f"{path}: exists already; choose another name with -o, or delete it")
+    start = b""
+    with suppress(OSError), open_regular(path) as file:
+        start = file.read(256)
+    if path.exists() and (mark is None or mark not in start):
+        raise ConfigurationError(f"{path}: exists already; choose another name with -o, or delete it")

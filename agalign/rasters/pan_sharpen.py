@@ -60,7 +60,7 @@ class PanSharpened(Product):
             return []
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
         settings = context.settings.write.model_copy(update=fine)
-        common = common_grid(capture.reference, settings, context.limits)
+        common = common_grid(capture.reference, settings, context.options.limits)
         layers, grid = output_layers(capture, usable, settings, common, context.read)
         context = replace(
             context, settings=context.settings.model_copy(update={"write": settings}), grid=grid, written_grey={}

@@ -78,7 +78,7 @@ class Preview(Product):
         mapped = context.with_pixels if context.settings.write.error_map else {}
         errors_px = {name: error_lattice_px(a, reference, context.grid, NODES_PX) for name, a in mapped.items()}
         part = write_preview(
-            context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)
+            context.reduced_bands, bands, errors_px, path, preview_bytes(context.options.captures), relief_view(context)
         )
         return [WrittenFile(self.kind, path, preview=part)]
 

@@ -75,6 +75,18 @@ class WrittenFile:
 
 
 @dataclass(frozen=True)
+class RenderOptions:
+    """What the rasters of a capture share with those of its flight."""
+
+    captures: int = 1
+    """Number of captures of the run, whose previews together have a limited size."""
+    limits: FlightLimits = ()
+    """Limits of all flights of the camera, as far as their rigs are known."""
+    common: OutputGrid | None = None
+    """Grid of the captures of the camera, if they share one."""
+
+
+@dataclass(frozen=True)
 class ProductContext:
     """The input of products: one capture, its alignments, and the grid of its output."""
 
@@ -89,9 +101,7 @@ class ProductContext:
     """One for each of the capture's `stack_bands`; empty if no moving band can be written."""
     grid: OutputGrid
     """Grid of all rasters; that of the reference's file if there are no layers."""
-    max_preview_bytes: int
-    limits: FlightLimits = ()
-    """Limits of all flights of the camera, as far as their rigs are known."""
+    options: RenderOptions = RenderOptions()
     written: list[WrittenFile] = field(default_factory=list)
     """Files of the products before this one in `PRODUCTS`."""
     read: ReadTile = read_tile
