@@ -29,7 +29,7 @@ from agalign.rasters.product import CapturePaths
 from agalign.records.listed_files import file_problem, states_of
 from agalign.records.run_record import NotInInputPart, RunPart
 from agalign.records.sidecar import FilePart, Sidecar, capture_status
-from agalign.records.sidecar_file import find_sidecars, label_of, read_sidecar, read_with_change, read_without_tables
+from agalign.records.sidecar_file import find_sidecars, label_of, read_checked, read_sidecar, read_with_change
 from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Tile
@@ -274,7 +274,7 @@ def results_not_in_input(
         if (label := label_of(path, out)) in own:
             continue
         with suppress(SidecarError):  # named by the commands that read it
-            result = read_without_tables(path)
+            result = read_checked(path).without_tables()
             exposures = exposures or _Exposures(flight.captures)
             if same := exposures.same_as(result):
                 yield NotInInputPart(capture=label, same_as=same)

@@ -16,7 +16,7 @@ from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import counted_sidecars
-from agalign.records.sidecar_file import add_products, label_of, read_without_tables, run_sidecars
+from agalign.records.sidecar_file import add_products, label_of, read_checked, run_sidecars
 from agalign.spectral_indices.formulas import Index
 from agalign.spectral_indices.indices_csv import refuse_foreign_table, to_check, update_table
 from agalign.spectral_indices.rasters import IndexRasters, IndexReport, write_rasters
@@ -102,7 +102,7 @@ def run_indices(
 
 def do_indices(task: IndexTask) -> list[IndexReport]:
     """Write the indices of one capture; the reports include errors. Raises SidecarError."""
-    sidecar, base = read_without_tables(task.sidecar), task.target / task.label
+    sidecar, base = read_checked(task.sidecar).without_tables(), task.target / task.label
     try:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)

@@ -10,7 +10,7 @@ from agalign.errors import InputError, SidecarError
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import counted_sidecars
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import label_of, read_without_tables, run_sidecars
+from agalign.records.sidecar_file import label_of, read_checked, run_sidecars
 
 LeftOut = list[tuple[str, str]]
 """(label of a capture, reason why it is left out)."""
@@ -95,7 +95,7 @@ def captures_of_run(out: Path) -> tuple[list[RunCapture], LeftOut]:
     for path, states in counted_sidecars(run_sidecars(out), out).items():
         label = label_of(path, out)
         try:
-            captures.append(RunCapture(label, path, read_without_tables(path), states))
+            captures.append(RunCapture(label, path, read_checked(path).without_tables(), states))
         except SidecarError as error:
             left_out.append((label, str(error)))
     return captures, left_out

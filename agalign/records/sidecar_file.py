@@ -116,14 +116,6 @@ def _parsed(path: Path, text: bytes) -> Sidecar:
         raise kind(f"{path}: {_problem(error, text)}") from None
 
 
-def read_without_tables(path: Path) -> Sidecar:
-    """Return a sidecar without its long tables: those of a season would not fit into memory.
-
-    Raises SidecarError, also for a sidecar that `read_checked` refuses.
-    """
-    return read_checked(path).without_tables()
-
-
 def check_products(paths: Iterable[Path]) -> None:
     """Raise InputError for a file that a sidecar beside it lists, and that is not as it was written."""
     for path in paths:

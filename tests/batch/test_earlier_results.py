@@ -22,7 +22,7 @@ from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
 from agalign.flight.groups import flights_of, model_names
-from agalign.records.sidecar_file import find_sidecars, read_sidecar, read_without_tables, write_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_checked, read_sidecar, write_sidecar
 from agalign.values.image import OutputGrid
 
 from ..builders import in_full_run
@@ -113,7 +113,7 @@ def test_files_without_tags_are_compared_by_their_contents(tmp_path: Path) -> No
 
 def test_what_identifies_a_capture(flight: Path, out: Path) -> None:
     capture = agalign.discover(flight).captures[0]
-    earlier = read_without_tables(find_sidecars(out)[0])
+    earlier = read_checked(find_sidecars(out)[0])
 
     def same(result: dict[str, Any], **tags: Any) -> bool | None:
         return is_same(earlier.model_copy(update=result), replace(capture, **tags))
@@ -144,7 +144,7 @@ def test_captures_with_other_options_are_done_again_and_this_is_printed_before(f
     lines = done.stderr.splitlines()
     said = lines.index("2 finished captures to be rendered again; changed since: --crop, --qa")
     assert said < next(k for k, line in enumerate(lines) if line.startswith("[1/2]"))
-    assert read_without_tables(first).output.crop == (0, 0, 480, 360)
+    assert read_checked(first).without_tables().output.crop == (0, 0, 480, 360)
     again = agalign_here(flight, "-o", out, *options)
     assert "again; changed since" not in again.stderr
     assert again.stderr.count("kept from an earlier run") == 2

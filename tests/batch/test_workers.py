@@ -27,7 +27,7 @@ from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
-from agalign.records.sidecar_file import find_sidecars, read_without_tables
+from agalign.records.sidecar_file import find_sidecars, read_checked
 
 from ..conftest import raising, seeded
 from ..host.pool_tasks import WhenUnpickled, signal_self, sleep, without_memory
@@ -62,7 +62,11 @@ def test_a_dask_cluster_processes_captures(flight: Path, aligned_flight: Path, t
         result += reports
     assert [r.is_complete for r in result] == [True, True]
     here, alone = (
-        [b.model_dump_json(exclude={"seconds"}) for path in find_sidecars(out) for b in read_without_tables(path).bands]
+        [
+            b.model_dump_json(exclude={"seconds"})
+            for path in find_sidecars(out)
+            for b in read_checked(path).without_tables().bands
+        ]
         for out in (tmp_path, aligned_flight)
     )
     assert here == alone

@@ -16,7 +16,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import probe, read_for_alignment, read_tile, with_saturation_values
-from agalign.records.sidecar_file import find_sidecars, read_without_tables
+from agalign.records.sidecar_file import find_sidecars, read_checked
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import Quality
 from agalign.values.image import Tile
@@ -66,7 +66,7 @@ def test_masks_flags_and_totals_have_the_same_saturated_pixels(tmp_path: Path) -
     settings = agalign.Settings(write=agalign.WriteSettings(qa=True), seed=agalign.SeedSettings(force="identity"))
     list(agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings))
     (sidecar,) = find_sidecars(tmp_path / "out")
-    shares = {b.band: b.saturated for b in read_without_tables(sidecar).bands}
+    shares = {b.band: b.saturated for b in read_checked(sidecar).without_tables().bands}
     assert shares["green"] == pytest.approx(0.1, abs=0.02)
     assert shares["red"] == 0
     with rasterio.open(tmp_path / "out" / "f.qa.tif") as flags:

@@ -13,7 +13,7 @@ import agalign
 from agalign.rasters.alignment_maps import _flags, error_map, moved_share, share_over_1_px
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import bands_of
-from agalign.records.sidecar_file import read_without_tables
+from agalign.records.sidecar_file import read_checked
 from agalign.spectral_indices.formulas import index_named, index_of_formula
 from agalign.spectral_indices.rasters import write_rasters
 from agalign.values import geometry, lens
@@ -160,7 +160,7 @@ def sidecar(flight: Path, shared: Shared, tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidecar: Path) -> None:
     path = sidecar.with_suffix(".qa.tif")
-    assert [p.file for p in read_without_tables(sidecar).products if p.kind == "qa"] == [path.name]
+    assert [p.file for p in read_checked(sidecar).without_tables().products if p.kind == "qa"] == [path.name]
     with rasterio.open(path) as raster, rasterio.open(sidecar.with_suffix(".tif")) as stack:
         assert raster.descriptions == ("all bands", *stack.descriptions)
         assert raster.shape == stack.shape
@@ -177,7 +177,7 @@ def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidec
 
 @pytest.mark.slow
 def test_indices_omit_pixels_flagged_in_their_own_bands(sidecar: Path, tmp_path: Path) -> None:
-    result, path = read_without_tables(sidecar), sidecar.with_suffix(".qa.tif")
+    result, path = read_checked(sidecar).without_tables(), sidecar.with_suffix(".qa.tif")
     plain, masked = (
         [replace(b, problem="") for b in bands_of(result, sidecar.parent, mask_qa=mask_qa)] for mask_qa in (False, True)
     )

@@ -21,7 +21,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.tag_seeds import rig_seed
 from agalign.rasters.alignment_maps import relief_layers
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import find_sidecars, read_sidecar, read_without_tables, write_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_checked, read_sidecar, write_sidecar
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
@@ -90,7 +90,7 @@ class Run:
             patch.setattr(batch, "align_capture_bands", lambda *_: alignments or self.alignments)
             outcome = batch.process_capture(batch.Task(self.capture, out, chosen))
         assert outcome.failed_products == ()
-        assert read_without_tables(outcome.path).model_dump_json() == outcome.result.model_dump_json()
+        assert read_checked(outcome.path).without_tables().model_dump_json() == outcome.result.model_dump_json()
         return outcome.path
 
     def with_relief(self, parallax_px: np.ndarray) -> dict[str, Alignment]:

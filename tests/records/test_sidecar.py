@@ -22,8 +22,8 @@ from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import (
     content_checksum,
     find_sidecars,
+    read_checked,
     read_sidecar,
-    read_without_tables,
     verify_outputs,
     write_sidecar,
 )
@@ -176,7 +176,7 @@ def test_the_reference_is_one_of_the_bands(tmp_path: Path) -> None:
     write_sidecar(path, example())
     data = read_json(path)
     path.write_text(json.dumps(data | {"reference": data["reference"] | {"band": "Ghost"}}))
-    for read in (read_sidecar, read_without_tables):
+    for read in (read_sidecar, read_checked):
         with pytest.raises(SidecarError, match=r"a\.json: bands: none of them is the reference band 'Ghost'"):
             read(path)
 

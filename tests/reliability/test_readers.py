@@ -25,7 +25,7 @@ from agalign.host.files import RUN_FILE
 from agalign.pixels.raster import probe
 from agalign.records.excluded import read_excluded
 from agalign.records.run_record import read_run_record
-from agalign.records.sidecar_file import read_sidecar, read_without_tables
+from agalign.records.sidecar_file import read_checked, read_sidecar
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 
@@ -138,7 +138,7 @@ def test_any_json(tmp_path: Path, data: object, raw: bytes | None) -> None:
     contents = json.dumps(data).encode() if raw is None else raw
     for name, read, given_path in (
         ("a.json", read_sidecar, tmp_path / "a.json"),
-        ("a.json", read_without_tables, tmp_path / "a.json"),
+        ("a.json", read_checked, tmp_path / "a.json"),
         ("panels.json", read_excluded, tmp_path),
         (RUN_FILE, read_run_record, tmp_path),
     ):
