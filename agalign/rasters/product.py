@@ -62,6 +62,9 @@ class WrittenFile:
     """Layout of the preview; None for other files."""
     is_flat: bool = False
     """The vignetting of raw numbers is corrected in the pixels."""
+    index_before: tuple[str, Grey] | None = None
+    """Of an index raster, the name of the index and its values in the unaligned bands, if these have the pixels of the
+    grid, as `ReducedBands.indices_before`."""
 
     @property
     def nodata_in_json(self) -> float | str | None:
@@ -110,8 +113,6 @@ class ProductContext:
     """Windows by moving band, measured under the mapping; empty unless tie points are written."""
     written_grey: dict[str, Grey] = field(default_factory=dict)
     """Written bands as grey images where these need no reduction, so that the files are not decoded for them."""
-    indices_before: dict[str, Grey] = field(default_factory=dict)
-    """Indices of the unaligned bands, by name, as `ReducedBands.indices_before`."""
     lost: dict[Path, str] = field(default_factory=dict)
     """Files of an earlier command that cannot be rendered again, and why."""
 
@@ -148,7 +149,7 @@ class ProductContext:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         places = {name: (file.path, index) for name, (file, index) in self.places.items()}
         bands = read_reduced_bands(self.capture, places, self.grid, self.read, self.written_grey)
-        return replace(bands, indices_before=self.indices_before)
+        return replace(bands, indices_before=dict(file.index_before for file in self.written if file.index_before))
 
 
 class Product(ABC):

@@ -178,34 +178,28 @@ class IndexRasters(Product):
         bands, problems = list(_bands(context)), []
         for index, report in zip(requested, write_rasters(bands, requested, base, label), strict=True):
             if report.path is not None:
-                self._add_before(context, index, report)
-                yield from self._files(report.path)
+                yield from self._files(context, index, report)
             elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
                 problems.append(f"{index.name}: {report.problem}")
         masked = list(_masked(bands, context))
         for raster in earlier:
-            problem = "its formula is unknown"
-            if raster.index is not None:
-                (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
-                problem = report.problem
-                if not problem:
-                    self._add_before(context, raster.index, report)
-            if problem:
-                context.lost[raster.path] = problem
+            if raster.index is None:
+                context.lost[raster.path] = "its formula is unknown"
+                continue
+            (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
+            if report.problem:
+                context.lost[raster.path] = report.problem
             else:
-                yield from self._files(raster.path)
+                yield from self._files(context, raster.index, report)
         if problems:
             raise InputError("; ".join(problems))
 
-    def _add_before(self, context: ProductContext, index: Index, report: IndexReport) -> None:
-        """Add the index of the unaligned bands for the report, if they have the pixels of the grid."""
+    def _files(self, context: ProductContext, index: Index, report: IndexReport) -> Iterator[WrittenFile]:
+        """Yield the raster of a report and its picture, with the index of the unaligned bands."""
+        assert report.path is not None
         before = index_before(context, index, (report.statistics.low, report.statistics.high))
-        if before is not None:
-            context.indices_before[index.name] = before
-
-    def _files(self, raster: Path) -> Iterator[WrittenFile]:
-        yield WrittenFile(self.kind, raster)
-        yield WrittenFile(self.kind, raster.with_suffix(".png"))
+        yield WrittenFile(self.kind, report.path, index_before=None if before is None else (index.name, before))
+        yield WrittenFile(self.kind, report.path.with_suffix(".png"))
 
 
 def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
