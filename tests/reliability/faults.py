@@ -686,7 +686,11 @@ LONG = (
     Fault("an input that may only be read", read_only),
     Fault("XMP nested 1200 deep", xmp("<a>" * 1200 + "</a>" * 1200)),
     Fault("a formula for a name", lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3)),
-    Fault("an earlier run inside the input, killed", killed_inside_the_input),
+    Fault(
+        "an earlier run inside the input, killed",
+        killed_inside_the_input,
+        "earlier: output folders of earlier runs are",
+    ),
     Fault("two captures that would write one file", colliding),
     Fault("a sidecar nested 200,000 deep", with_sidecar("(?s).+", _DEEP)),
     Fault("a terminal of ASCII", both(strange_names, with_environment(PYTHONIOENCODING="ascii"))),
