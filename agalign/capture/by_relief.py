@@ -147,7 +147,7 @@ class _Band:
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
         pair, windows = self.refined.pair, held_out.residual
-        error = mapping_error(pair, mapping, self.joint.covariance_px2, windows)
+        error = mapping_error(pair, mapping, self.joint.covariance_px2, windows, self.plane.field)
         return Candidate(pair, mapping, error, windows, self.joint, held_out, held_out_p95_px=p95_px)
 
 
@@ -338,10 +338,10 @@ def _with_field(candidate: Candidate) -> Candidate:
     if displacement is None or displacement.field is None:
         return candidate
     assert candidate.error.covariance_px2 is not None
-    mapping = replace(mapping, field=displacement.field)
-    error = mapping_error(pair, mapping, candidate.error.covariance_px2, candidate.windows)
+    with_field = replace(mapping, field=displacement.field)
+    error = mapping_error(pair, with_field, candidate.error.covariance_px2, candidate.windows, mapping.field)
     p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.after_p95_px}
-    return replace(candidate, mapping=mapping, error=error, held_out_p95_px=p95_px)
+    return replace(candidate, mapping=with_field, error=error, held_out_p95_px=p95_px)
 
 
 def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:

@@ -129,11 +129,13 @@ def rig_predictions(
     for pair in covered:
         of_plane = rig_prediction(pair, rig, known)
         parallax, parallax_std_px = _parallax_by_rig(pair, parallaxes, rig)
-        error_px = pair.in_moving_file_px(parallax_std_px, of_plane.fixed_to_moving)
-        prediction = _with_added_error(of_plane.of_plane, error_px)
-        # A homography does not follow the relief that captures of the flight have. The plane of a result, which is
-        # compared with the prediction, is not displaced by it.
-        of_scene = prediction if parallax is not None else _with_relief_of_flight(prediction, rig, pair.name)
+        # The plane of a result, which is compared with the prediction, is not displaced by the relief.
+        if parallax is None:  # a homography does not follow the relief that captures of the flight have
+            error_px = rig.parallax_px.get(pair.name, 0.0) * rig.magnification(pair.name)
+        else:
+            error_px = pair.in_moving_file_px(parallax_std_px, of_plane.fixed_to_moving)
+        prediction = of_plane.of_plane
+        of_scene = replace(prediction, std_px=math.hypot(prediction.std_px, error_px))
         predictions[pair.name] = RigPrediction(pair, prediction, of_scene, parallax)
     return predictions
 
@@ -167,14 +169,6 @@ def _parallax_by_rig(
     return Parallax(relief, (x, y)).with_occlusions(), error * relief.rms_px
 
 
-def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:
-    return replace(prediction, std_px=math.hypot(prediction.std_px, error_px))
-
-
-def _with_relief_of_flight(prediction: Prediction, rig: Rig, band: str) -> Prediction:
-    return _with_added_error(prediction, rig.parallax_px.get(band, 0.0) * rig.magnification(band))
-
-
 def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
     """Return the bands to learn from scratch if the flight's network did not align them.
 
@@ -182,19 +176,15 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capt
     no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
     height than those of the flight's network.
     """
-    known = observed(pairs, result, capture)
-    has_relief = any(alignment.mapping.parallax is not None for alignment in result.values())
+    predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
 
     def is_skipped(pair: BandPair) -> bool:
         alignment = result.get(pair.name)
-        if alignment is None or pair.name not in rig.mean or not pair.has_rig_pixels:
+        if alignment is None or pair.name not in predictions:
             return False
         joint = alignment.joint
         is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
         has_common_structure = alignment.seed.trusted or is_above_chance
-        prediction = predict_band(rig, pair.name, known)
-        if not has_relief:
-            prediction = _with_relief_of_flight(prediction, rig, pair.name)
-        return not has_common_structure or prediction.std_px <= DELIVERED_STD_PX
+        return not has_common_structure or predictions[pair.name].of_scene.std_px <= DELIVERED_STD_PX
 
     return {pair.name for pair in pairs if not is_skipped(pair)}

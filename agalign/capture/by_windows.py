@@ -77,8 +77,7 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     warped = WarpedPair.of(pair, mapping, windows)
     if warped.alias_peak().ratio > MAX_ALIAS_PEAK:
         return None
-    error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, relief_std_px=0.0)
-    error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
+    error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, mapping.field, relief_std_px=0.0)
     evidence = warped.residual, band.joint, warped
     return Candidate(pair, mapping, error, *evidence, inherited_issues=band.rejected)
 

@@ -15,7 +15,7 @@ from agalign.values.choices import Geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
 from agalign.verify.checks import PREDICTED_WITH, issues_of, seed_fits
@@ -65,19 +65,23 @@ class Candidate:
             return self.inherited_issues
         pixel_px = self.pair.file_pixel_size_px
         found = issues_of(self.mapping, self.error, self.windows, self.joint, self.checked_px, pixel_px)
-        if not found and self.images is not None:  # costly
-            found = self.images.issues()
+        found = found or self._issues_of_pixels
         issues = tuple(issue for issue in found if issue.kind not in self.ignored)
         if issues or self.other_windows is None:
             return issues
         error = replace(self.error, windows=self.other_windows)
         return replace(self, windows=self.other_windows, error=error, other_windows=None).issues
 
+    @cached_property
+    def _issues_of_pixels(self) -> tuple[Issue, ...]:
+        """What the checks of pixels find, which are costly."""
+        return () if self.images is None else self.images.issues()
+
     @property
     def may_predict(self) -> bool:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
-        is_confirmed = bool(self.inherited_issues) or all(issue.kind in PREDICTED_WITH for issue in self.issues)
-        return is_confirmed and math.isfinite(self.std_px)
+        found = () if self.inherited_issues else (*self.issues, *self._issues_of_pixels)
+        return all(issue.kind in PREDICTED_WITH for issue in found) and math.isfinite(self.std_px)
 
     @cached_property
     def std_px(self) -> float:
@@ -118,17 +122,21 @@ def mapping_error(
     mapping: PixelMapping,
     covariance_px2: NDArray[np.float64],
     windows: Residual,
+    lens_field: DisplacementField | None = None,
     *,
     relief_std_px: float | None = None,
 ) -> MappingError:
     """Return the error of a mapping that was estimated on the images of a pair.
 
     Unknown lens shapes are part of it, unless the covariance (12, 12) contains them, and so is the relief that a
-    mapping without one lacks: by default that of the flight.
+    mapping without one lacks: by default that of the flight. The displacement field beyond that of the lenses,
+    `lens_field`, by default that of the rig, continues by chance where no window is near.
     """
-    spread_px = 0.0
+    spread_px, lens_field = 0.0, pair.field if lens_field is None else lens_field
     if mapping.field is not None and windows.is_measured.any():
         displacements_px = mapping.field(windows.measured_px)
+        if lens_field is not None:
+            displacements_px = displacements_px - lens_field(windows.measured_px)
         spread_px = float(np.sqrt(displacements_px.var(axis=0).sum()))
     return MappingError(
         pair.fixed.size_px,

@@ -32,7 +32,7 @@ def with_map_estimates(bands: Sequence[RefinedBand], rig: Rig | None) -> list[Re
     """Return the bands of a capture with the MAP estimates of all windows, and with those of each half of them.
 
     The windows of a band are ignored, also in its halves, if all together are too few or their correction is too large.
-    Bands without a covariance are only estimated by the others.
+    Bands without a covariance have their result.
     """
     max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
     residuals = [band.warped.residual for band in bands]

@@ -30,6 +30,9 @@ _COMMON_ERROR_FACTOR = 12.0
 in common average out between them only."""
 _FAR_SPACINGS = 3.0
 """Window spacings, beyond the first, over which a mapping becomes an extrapolation."""
+_GAP_SPACINGS = 2.0
+"""Window spacings that are left out between windows that verify a relief: these are in every other field of a
+chessboard, whose sides are four spacings. The windows of the fit are in the other fields."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class MappingError:
         error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2)
                      + max(u(x)^2, z(x)^2, m(x)^2)
 
-    D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 within one spacing of the measured windows to 1, u is
+    D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 near the measured windows to 1, u is
     the displacement that the mapping does not contain, by the residual shifts of the nearest windows beyond their
     noise, z the standard error of the parallax times the baseline, and m the shift of an area that moved.
 
@@ -169,11 +172,14 @@ class MappingError:
         return cKDTree(self._measured.centres_px)
 
     def _far(self, points_px: Points) -> NDArray[np.float64]:
-        """Return (n,) from 0 to 1 how far points (n, 2) are from measured windows: 0 within one spacing of these."""
+        """Return (n,) from 0 to 1 how far points (n, 2) are from measured windows: 0 within one spacing of these, or
+        of the fields of their chessboard.
+        """
         if self._measured is None:
             return np.zeros(len(points_px))
         distance_px, _ = self._tree.query(points_px)
-        return np.asarray(np.clip((distance_px / self._spacing_px - 1) / _FAR_SPACINGS, 0, 1))
+        near_spacings = 1.0 if self.parallax is None else 1.0 + _GAP_SPACINGS
+        return np.asarray(np.clip((distance_px / self._spacing_px - near_spacings) / _FAR_SPACINGS, 0, 1))
 
     def _covariance_px2(self, points_px: Points) -> NDArray[np.float64]:
         """Return the variance (n,) at points (n, 2) by the covariance of corners and lens shapes."""

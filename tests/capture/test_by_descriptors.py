@@ -11,7 +11,7 @@ from agalign.capture import candidate as module
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_descriptors import by_descriptors
-from agalign.capture.candidate import RefinedBand
+from agalign.capture.candidate import RefinedBand, mapping_error
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import Settings
 from agalign.fit.displacement_field import DisplacementResult
@@ -19,7 +19,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import ReliefUse
 from agalign.values.geometry import Matrix
-from agalign.values.issues import REPEATS, RETRIEVAL, Issue
+from agalign.values.issues import INACCURATE, REPEATS, RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField
 
 from ..builders import decided, displaced_views, joint_result, pair_of, texture, two_views, whole
@@ -54,6 +54,27 @@ def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, mon
     unretrieved = module.Candidate.of(warped_pair, replace(GOOD, retrieval=0.0))
     assert [issue.kind for issue in unretrieved.issues] == [RETRIEVAL]
     assert [issue.kind for issue in module.Candidate.of(warped_pair, GOOD).issues] == [REPEATS]
+
+
+def test_a_further_issue_never_improves_a_status(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mapping in a repetitive scene is no prediction, whatever else is found."""
+    warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
+    inaccurate = replace(GOOD, corner_std_xy_px=((3.0, 3.0),) * 4)
+    for found, may_predict in (((), True), ((Issue(REPEATS, 16.0),), False)):
+        monkeypatch.setattr(WarpedPair, "issues", lambda _, found=found: found)
+        candidate = module.Candidate.of(warped_pair, inaccurate)
+        assert [issue.kind for issue in candidate.issues] == [INACCURATE]
+        assert candidate.may_predict is may_predict
+
+
+def test_the_lens_field_of_the_rig_does_not_continue_by_chance(pair: BandPair) -> None:
+    lens = DisplacementField.sampled(lambda points: 0.01 * points, 48, pair.fixed.size_px)
+    with_rig = replace(pair, field=lens)
+    for one, spread_px in ((with_rig, 0.0), (pair, 1.0)):
+        mapping = replace(pair.mapping(TRUTH), field=lens)
+        error = mapping_error(one, mapping, np.eye(8), WarpedPair.of(pair, mapping).residual)
+        assert error.field_std_px == pytest.approx(spread_px, abs=0.5)
+        assert (error.field_std_px == 0) == (spread_px == 0)
 
 
 def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agalign.fit.windows import RELIEF_CHECK_WINDOW_PX, FixedWindows
+from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.geometry import PairScales
 from agalign.values.image import Tile
@@ -15,7 +17,7 @@ from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 from agalign.values.residual import Residual, noise_px
 
-from ..builders import grid_px, residual_of
+from ..builders import grid_px, residual_of, texture
 
 SIZE = 640, 480
 PIXELS = geometry.lattice(*SIZE, *SIZE)
@@ -130,13 +132,27 @@ def with_steps(scale: PixelScale = SAME) -> Parallax:
 
 @pytest.mark.parametrize("scale", [SAME, HALF])
 def test_the_error_of_the_relief_counts_where_it_is_larger_than_that_of_the_windows(scale: PixelScale) -> None:
-    parallax, plain = with_steps(scale), error_of([0.05] * 4, columns(7))
+    parallax = with_steps(scale)
+    error = replace(error_of([0.05] * 4, columns(7)), parallax=parallax)
     points = np.random.default_rng(1).uniform(0, SIZE, (500, 2))
-    modelled_px2, unmodelled_px2 = plain.smooth_px2(points)
+    modelled_px2, unmodelled_px2 = error.smooth_px2(points)
     z_px2 = parallax.variance_px2(points)
     assert 0.1 < (z_px2 > unmodelled_px2).mean() < 0.9
     expected = np.sqrt(modelled_px2 + np.maximum(z_px2, unmodelled_px2))
-    np.testing.assert_allclose(replace(plain, parallax=parallax).error_px(points), expected)
+    np.testing.assert_allclose(error.error_px(points), expected)
+
+
+def test_the_fields_between_windows_that_verify_a_relief_are_near() -> None:
+    """They are in the white fields of a chessboard; the windows of the fit are in the black ones."""
+    image = texture(*SIZE)
+    white = FixedWindows.on_chessboard(image.valid, structure_field(image), RELIEF_CHECK_WINDOW_PX, white=True)
+    windows = residual_of(white.centres_px, (0.0, 0.0))
+    error = error_of([0.1] * 4, windows)
+    black_px = np.array([[320.0, 320.0], [320.0, 64.0]])  # centres of black fields
+    distances_px = np.linalg.norm(white.centres_px[None] - black_px[:, None], axis=2).min(axis=1)
+    assert distances_px.min() > 70
+    assert (error._far(black_px) > 0.3).all()
+    assert (replace(error, parallax=with_steps())._far(black_px) < 0.1).all()
 
 
 @pytest.mark.parametrize("parallax", [None, with_steps(), with_steps(HALF)])
@@ -186,3 +202,13 @@ def test_windows_with_much_noise_say_little_of_the_error() -> None:
     assert 0.08 < residual.where(peaks_sigma > 10).std_px < residual.std_px < 0.2
     error = MappingError((1680, 1120), np.zeros((8, 8)), residual).error_px(centres_px)
     assert np.sqrt(np.square(error).mean()) < 0.25
+
+
+def test_windows_of_several_captures_have_the_weights_of_one() -> None:
+    """Their centres are the same, and the tolerated noise is relative to their spacing."""
+    rng = np.random.default_rng(1)
+    centres_px = geometry.lattice(1680, 1120, 15, 10)
+    one = replace(residual_of(centres_px, rng.normal(size=(150, 2))), peaks_sigma=rng.uniform(7, 30, 150))
+    three = Residual.joined([one] * 3)
+    assert three.spacing_px == one.spacing_px > 100
+    assert three.std_px == pytest.approx(one.std_px)
