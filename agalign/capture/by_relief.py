@@ -47,7 +47,7 @@ from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, lengths_in_common_px
 from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
@@ -371,7 +371,7 @@ def _decreases_shifts(plane: Residual, relief: Residual) -> bool:
     # Standard errors of the mean decrease: at most 3.0 in flat scenes with noise, and at least 5.4 with boxes, booms,
     # trees and leaves.
     min_sigma = 4.0
-    before, after = (np.log1p(np.square(px / MIN_PARALLAX_PX)) for px in plane.lengths_px_with(relief))
+    before, after = (np.log1p(np.square(px / MIN_PARALLAX_PX)) for px in lengths_in_common_px(plane, relief))
     return len(before) > 1 and mean_in_standard_errors(before - after) >= min_sigma
 
 

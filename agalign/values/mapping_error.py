@@ -21,7 +21,7 @@ from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
 from agalign.values.resampling import between_nodes, nodes_along
-from agalign.values.residual import Residual, noise_px
+from agalign.values.residual import Residual, noise_px, square_weights
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
@@ -220,7 +220,7 @@ class MappingError:
         measured = self._measured
         if measured is None:
             return np.zeros(len(points_px))
-        noise_px2, precision = np.square(noise_px(measured.peaks_sigma)), measured.square_weights
+        noise_px2, precision = np.square(noise_px(measured.peaks_sigma)), square_weights(measured)
         squares = np.square(measured.shifts_px).sum(axis=1)
         count = min(8, len(squares))  # nearest windows
         distance, index = (values.reshape(-1, count) for values in self._tree.query(points_px, k=count))

@@ -100,25 +100,10 @@ class Residual:
         median, p95 = np.percentile(self.lengths_px, (50, 95)).tolist() if len(self.lengths_px) else (np.inf, np.inf)
         return median, p95
 
-    def lengths_px_with(self, other: "Residual") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the lengths (m,) of the shifts of this and of another residual in the windows of one grid that both
-        have measured, px of the reference.
-        """
-        own, others = (residual.where(residual.is_measured) for residual in (self, other))
-        key = np.array([1 << 32, 1])  # column and row in one number
-        _, first, second = np.intersect1d(own.cells @ key, others.cells @ key, return_indices=True)
-        return own.lengths_px[first], others.lengths_px[second]
-
     @property
     def coverage(self) -> float:
         """Share of the textured windows in which a shift could be measured."""
         return float(self.is_measured.mean()) if len(self.shifts_px) else 0.0
-
-    @property
-    def square_weights(self) -> NDArray[np.float64]:
-        """(m,) weights of the squares of the measured shifts, up to 1: inversely proportional to their variances."""
-        noise = noise_px(self.peaks_sigma[self.is_measured])
-        return np.asarray((1 + np.square(noise / (_TOLERATED_NOISE * self.spacing_px))) ** -2)
 
     @property
     def std_px(self) -> float:
@@ -126,12 +111,12 @@ class Residual:
         without any.
 
         A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
-        distribution with the same median, and with the same 80th percentile. Windows have `square_weights`. At least
-        half of the RMS is kept, because the noise is known only to a factor.
+        distribution with the same median, and with the same 80th percentile. Windows are weighted by their noise. At
+        least half of the RMS is kept, because the noise is known only to a factor.
         """
         if not len(self.lengths_px):
             return math.inf
-        noise, weights = noise_px(self.peaks_sigma[self.is_measured]), self.square_weights
+        noise, weights = noise_px(self.peaks_sigma[self.is_measured]), square_weights(self)
 
         def quantile(values: NDArray[np.float64], p: float) -> float:
             return float(np.quantile(values, p, weights=weights, method="inverted_cdf"))
@@ -179,6 +164,23 @@ class Residual:
         return replace(
             self, centres_px=centres_px, shifts_px=shifts_px, peaks_sigma=self.peaks_sigma / math.sqrt(scale.mean)
         )
+
+
+def square_weights(residual: Residual) -> NDArray[np.float64]:
+    """Return the weights (m,) of the squares of measured shifts, up to 1: inversely proportional to their variances."""
+    noise = noise_px(residual.peaks_sigma[residual.is_measured])
+    return np.asarray((1 + np.square(noise / (_TOLERATED_NOISE * residual.spacing_px))) ** -2)
+
+
+def lengths_in_common_px(one: Residual, other: Residual) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lengths (m,) of the shifts of two residuals in windows that both have measured, px of the reference.
+
+    Their windows are of one grid.
+    """
+    one, other = (residual.where(residual.is_measured) for residual in (one, other))
+    key = np.array([1 << 32, 1])  # column and row in one number
+    _, first, second = np.intersect1d(one.cells @ key, other.cells @ key, return_indices=True)
+    return one.lengths_px[first], other.lengths_px[second]
 
 
 @validated.dataclass(frozen=True, config=RECORD)
