@@ -312,6 +312,26 @@ def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monk
     np.testing.assert_array_equal(result, expected)
 
 
+def test_the_difference_of_ndvi_is_right_for_mosaics_of_integers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reflectance times 10,000 as uint16: red exceeds near infrared in places, and bands of 0 or nodata have no NDVI."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    spring, summer = rng.integers(1, 10_000, (4, 30, 40)), rng.integers(1, 10_000, (5, 30, 40))
+    spring[0, :3], summer[4, :, :5] = 0, 65_535  # red of spring; near infrared of summer: nodata
+    Path("dates").mkdir()
+    for name, bands in {"spring.tif": spring, "dates/summer.tif": summer}.items():
+        write_band(Path(name), bands.astype(np.uint16), nodata=65_535)
+    (block,) = (b for b in blocks_of(ROOT / "docs/how-to/two-dates.md") if b.text.startswith("rio calc"))
+    run_command(*commands_of(block), block.where)
+    (red, _, _, nir), (_, later_red, _, _, later_nir) = spring, summer
+    expected = (later_nir - later_red) / (later_nir + later_red) - (nir - red) / (nir + red)
+    expected[:3], expected[:, :5] = np.nan, np.nan
+    with rasterio.open("change.tif") as change:
+        np.testing.assert_allclose(change.read(1), expected, atol=1e-6)
+
+
 def test_the_python_of_the_readme_aligns_pixels() -> None:
     """NIR has reversed contrast, a hole of NaN, and a displacement of 1.5 px that no homography represents."""
 
