@@ -2,8 +2,12 @@
 
 python examples/training_tiles.py OUT
 
-All bands have the pixels of the reference, so one label raster fits all of them. Neighbouring captures overlap: split
-by flight, or by position with a gap between the parts as here, not by tile. The gap must be wider than an image.
+All bands have the pixels of the reference, so one label raster fits all of them: draw it over `<capture>.tif`, and save
+it as `<capture>.labels.tif`. In a loss per pixel, use `usable.all(0)`.
+
+Neighbouring captures overlap: the split is by position, and no capture for validation has ground of one for training.
+That needs the footprints of `OUT/flight.geojson` (GPS position, altitude, yaw and focal length in the tags). With
+several flights, validate on one over other ground.
 """
 
 import json
@@ -44,20 +48,46 @@ class Tiles(torch.utils.data.Dataset):
         return np.nan_to_num(bands), usable & np.isfinite(bands)
 
 
-def longitude(stack):
-    """Return the position of a capture from its sidecar."""
-    position = json.loads(stack.with_suffix(".json").read_text(encoding="utf-8"))["position"]
-    if position is None:
-        sys.exit(f"{stack}: has no GPS position; split by flight")
-    return position["longitude"]
+def box(feature):
+    """Return the west, south, east and north ends of a footprint, degrees, with its standard error as a margin."""
+    if feature["geometry"] is None or feature["geometry"]["type"] != "Polygon":
+        sys.exit(f"{feature['id']}: has no footprint (GPS position, altitude, yaw or focal length); split by flight")
+    corners = np.array(feature["geometry"]["coordinates"][0])
+    margin_lat = (feature["properties"]["accuracy_m"] or 0) / 111_000
+    margin = np.array([margin_lat / np.cos(np.radians(corners[0, 1])), margin_lat])
+    return np.concatenate([corners.min(axis=0) - margin, corners.max(axis=0) + margin])
+
+
+def split(boxes, share=0.6):
+    """Return the western captures for training, and those captures for validation that overlap none of them."""
+    names = sorted(boxes, key=lambda name: boxes[name][0] + boxes[name][2])
+    training, others = names[: int(len(names) * share)], names[int(len(names) * share) :]
+    west, south, east, north = np.array([boxes[name] for name in training]).reshape(-1, 4).T
+
+    def is_apart(box):
+        return not np.any((west < box[2]) & (box[0] < east) & (south < box[3]) & (box[1] < north))
+
+    return training, [name for name in others if is_apart(boxes[name])]
 
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit("usage: python examples/training_tiles.py OUT")
-    stacks = [path.with_name(path.name.replace(".qa", "")) for path in Path(sys.argv[1]).rglob("*.qa.tif")]
-    stacks.sort(key=longitude)  # from west to east; captures in between are not used
-    training, validation = Tiles(stacks[: len(stacks) * 6 // 10]), Tiles(stacks[len(stacks) * 8 // 10 :])
+    out = Path(sys.argv[1])
+    stacks = {path.with_name(path.name.replace(".qa", "")) for path in out.rglob("*.qa.tif")}
+    if not stacks:
+        sys.exit(f"{out}: has no quality flags; align with --qa")
+    flight_map = out / "flight.geojson"
+    if not flight_map.is_file():
+        sys.exit(f"{flight_map}: is missing, as no capture has a GPS position; split by flight")
+    features = json.loads(flight_map.read_text(encoding="utf-8"))["features"]
+    boxes = {out / f["properties"]["stack"]: box(f) for f in features if f["properties"].get("stack")}
+    training, validation = split({stack: boxes[stack] for stack in stacks & boxes.keys()})
+    unused = len(stacks) - len(training) - len(validation)
+    print(f"captures: {len(training)} for training, {len(validation)} for validation, {unused} unused")
+    if not training or not validation:
+        sys.exit("all captures of the eastern part overlap one for training; use a larger flight, or split by flight")
+    training, validation = Tiles(training), Tiles(validation)
     print(f"{len(training)} tiles for training, {len(validation)} for validation")
     for bands, usable in torch.utils.data.DataLoader(training, batch_size=8):
         loss = ((bands - bands.mean()) ** 2 * usable).sum() / usable.sum()

@@ -1,6 +1,7 @@
 """Every command and every script of the documents is run, every example too, and every link leads somewhere."""
 
 import csv
+import json
 import os
 import re
 import runpy
@@ -205,6 +206,15 @@ EXAMPLES = {
 """{name: (arguments, a part of what it prints, how many times)}."""
 
 
+def move_second_capture_east(flight_map: Path) -> None:
+    """Move its footprint by a hundredth of a degree, far from the first capture."""
+    content = json.loads(flight_map.read_text(encoding="utf-8"))
+    (ring,) = content["features"][1]["geometry"]["coordinates"]
+    for corner in ring:
+        corner[0] += 0.01
+    flight_map.write_text(json.dumps(content), encoding="utf-8")
+
+
 def test_every_example_is_run() -> None:
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
 
@@ -216,6 +226,7 @@ def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.chdir(desk)
     if name == "training_tiles.py":
         assert agalign_here("flight", "-o", "aligned", "--qa").returncode == 0
+        move_second_capture_east(Path("aligned/flight.geojson"))
     monkeypatch.setattr(sys, "argv", [name, *arguments.split()])
     monkeypatch.syspath_prepend(str(ROOT / "examples"))  # as `python examples/NAME` does
     with warnings.catch_warnings(action="ignore"):
@@ -312,10 +323,44 @@ def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monk
     np.testing.assert_array_equal(result, expected)
 
 
+def footprint(west: float, south: float = 52.0, accuracy_m: float = 5.0) -> dict[str, Any]:
+    """A capture of the flight map: a square of 0.001 degrees."""
+    ring = [[west + x, south + y] for x, y in ((0, 0), (0.001, 0), (0.001, 0.001), (0, 0.001), (0, 0))]
+    geometry = {"type": "Polygon", "coordinates": [ring]}
+    return {"id": "IMG_0001", "geometry": geometry, "properties": {"accuracy_m": accuracy_m}}
+
+
+def test_the_tiles_for_validation_show_no_ground_of_those_for_training() -> None:
+    names = runpy.run_path(str(ROOT / "examples" / "training_tiles.py"))
+    box, split = names["box"], names["split"]
+    row = {number: box(footprint(5 + 0.0002 * number)) for number in range(10)}  # neighbours overlap by 80 %
+    assert split(row) == ([0, 1, 2, 3, 4, 5], [])
+    long_row = {number: box(footprint(5 + 0.0002 * number)) for number in range(30, 0, -1)}
+    training, validation = split(long_row)
+    assert training == [*range(1, 19)]
+    assert validation == [*range(24, 31)]  # 23 is 0.0010 degrees east of 18: they touch, and positions are uncertain
+    far_north = box(footprint(5.0031, south=53.0))
+    assert split({1: box(footprint(5.0)), 2: box(footprint(5.003)), 3: far_north}, 0.7) == ([1, 2], [3])
+    with pytest.raises(SystemExit, match="IMG_0001: has no footprint"):
+        box({"id": "IMG_0001", "geometry": {"type": "Point", "coordinates": [5, 52]}})
+
+
+def test_captures_that_overlap_make_no_data_set(
+    desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(desk)
+    for stack in Path("aligned").rglob("IMG_000?.tif"):
+        stack.with_suffix(".qa.tif").touch()
+    monkeypatch.setattr(sys, "argv", ["training_tiles.py", "aligned"])
+    with pytest.raises(SystemExit, match="overlap one for training"):
+        runpy.run_path(str(ROOT / "examples" / "training_tiles.py"), run_name="__main__")
+    assert capsys.readouterr().out == "captures: 1 for training, 0 for validation, 1 unused\n"
+
+
 def test_the_difference_of_ndvi_is_right_for_mosaics_of_integers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reflectance times 10,000 as uint16: red exceeds near infrared in places, and bands of 0 or nodata have no NDVI."""
+    """Reflectance times 10,000 as uint16: red exceeds near infrared in places; bands of 0 or nodata have no NDVI."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     spring, summer = rng.integers(1, 10_000, (4, 30, 40)), rng.integers(1, 10_000, (5, 30, 40))
