@@ -20,11 +20,11 @@ _NOISE_PX_SIGMA2 = 48.0
 of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
 
 
-_TOLERATED_NOISE = 1 / 150
-"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 0.75 px for windows of 112
-px, 0.2 px for those of 64 px that overlap by half. In images with 30 % of noise, the error by windows without weights
-is up to five times that at tie points; with a value from 1/100 to 1/300, errors of sharp images differ by less than a
-tenth."""
+_TOLERATED_NOISE = 1 / 75
+"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 1.5 px for windows of 112
+px, 0.4 px for those of 64 px that overlap by half. In images with 30 % of noise, the error by windows without weights
+is up to five times that at tie points. With 1/150, a blurred band passes whose error is above 1 px at a tenth of the
+tie points: low peaks of blurred images are not noise alone."""
 
 
 def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
