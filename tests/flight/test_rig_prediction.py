@@ -134,6 +134,15 @@ def test_with_few_captures_only_two_estimators_are_used() -> None:
     assert six.std_px < 0.5 * five.std_px
 
 
+def test_a_prediction_by_the_motion_of_the_flight_is_not_one_by_neighbours() -> None:
+    """Its time is unknown: only the regression over all captures predicts the step of the bands."""
+    captures = [capture(0.0, motion=(float(k), 0.0), steps_px=(2.0 * k, 0.0)) for k in range(6)]
+    moving = replace(rig(*captures), factors=("motion",))
+    prediction = predict_band(moving, "Red", Observation(None, {}, {}, motion=(3.0, 0.0)))
+    assert distance_px(prediction.fixed_to_moving, moving.mean["Red"], SIZE) > 3
+    assert prediction.source == "flight"
+
+
 def test_the_extremes_exclude_outliers() -> None:
     captures = [capture(d) for d in (-2.0, 0.5, 3.0, 1.0, 100.0)]
     ends = extreme_mappings(rig(*captures), "Red")
