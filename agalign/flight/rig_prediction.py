@@ -67,8 +67,9 @@ def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
 
 
 def band_summaries(rig: Rig) -> list[dict[str, Any]]:
-    """Return for each band the offset of the image centre, the baseline and the largest displacement by its field, px
-    of the reference, and the errors of predictions, px of the band.
+    """Return the offset of the image centre, baseline, errors of predictions and displacements of each band.
+
+    Errors are in px of the band, the other lengths in px of the reference.
     """
     centre = (np.array(rig.size_px, float) - 1) / 2
     field_px = {b: float(np.linalg.norm(f.displacements_px, axis=-1).max()) for b, f in rig.fields.items()}

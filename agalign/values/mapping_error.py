@@ -172,8 +172,9 @@ class MappingError:
         return cKDTree(self._measured.centres_px)
 
     def _far(self, points_px: Points) -> NDArray[np.float64]:
-        """Return (n,) from 0 to 1 how far points (n, 2) are from measured windows: 0 within one spacing of these, or
-        of the fields of their chessboard.
+        """Return (n,) from 0 to 1 how far points (n, 2) are from measured windows.
+
+        It is 0 within one spacing of the windows. If these verify a relief, it is 0 also in the fields between them.
         """
         if self._measured is None:
             return np.zeros(len(points_px))

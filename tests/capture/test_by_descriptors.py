@@ -57,7 +57,7 @@ def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, mon
 
 
 def test_a_further_issue_never_improves_a_status(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mapping in a repetitive scene is no prediction, whatever else is found."""
+    """A repetitive scene prevents a prediction, also where another check fails first."""
     warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
     inaccurate = replace(GOOD, corner_std_xy_px=((3.0, 3.0),) * 4)
     for found, may_predict in (((), True), ((Issue(REPEATS, 16.0),), False)):
