@@ -30,7 +30,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.dense import DenseMatching, View, nearer_sign
-from agalign.fit.displacement_field import MIN_WINDOWS, mean_in_standard_errors
+from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.window_fit import (
     BaselinePrior,
     WindowFit,
@@ -47,7 +47,7 @@ from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
-from agalign.values.residual import Residual, lengths_in_common_px
+from agalign.values.residual import Residual, is_decreased_beyond_chance
 from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
@@ -361,18 +361,12 @@ def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> boo
 
 def _decreases_shifts(plane: Residual, relief: Residual) -> bool:
     """Return True if a relief decreases the p95 of held-out windows by more than it increases their median, and their
-    robust loss by more than by chance.
+    shifts by more than by chance.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
-    The p95 alone is that of wrong peaks where images are noisy.
     """
-    if plane.p95_px - relief.p95_px < max(0.0, relief.median_px - plane.median_px):
-        return False
-    # Standard errors of the mean decrease: at most 3.0 in flat scenes with noise, and at least 5.4 with boxes, booms,
-    # trees and leaves.
-    min_sigma = 4.0
-    before, after = (np.log1p(np.square(px / MIN_PARALLAX_PX)) for px in lengths_in_common_px(plane, relief))
-    return len(before) > 1 and mean_in_standard_errors(before - after) >= min_sigma
+    p95_decrease_px, median_increase_px = plane.p95_px - relief.p95_px, relief.median_px - plane.median_px
+    return p95_decrease_px >= max(0.0, median_increase_px) and is_decreased_beyond_chance(plane, relief)
 
 
 def _verifying(bands: Sequence[int]) -> list[list[int]]:

@@ -21,9 +21,9 @@ from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
-from agalign.values.least_squares import cauchy_weights, shift_scale_px
+from agalign.values.least_squares import cauchy_weights, mean_in_standard_errors, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.residual import Residual, noise_px
+from agalign.values.residual import Residual, is_decreased_beyond_chance, noise_px
 
 _FIELD_WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
@@ -75,8 +75,8 @@ class DisplacementEstimator:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
 
         The shifts are measured again with the field of each round until their median is at most 0.2 px, as correlation
-        is sharper and large shifts are measured in steps. Returns no field if it folds the image or increases the p95
-        of held-out windows; None if too few windows are measured.
+        is sharper and large shifts are measured in steps. Returns no field if it folds the image, increases the p95 of
+        held-out windows or decreases their shifts by no more than by chance; None if too few windows are measured.
         """
         field = None if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
         max_rounds, converged_px = 4, 0.2
@@ -90,9 +90,10 @@ class DisplacementEstimator:
             if np.median(shifts.distances_px()) <= converged_px:
                 break
         assert field is not None
-        held_out, before_p95_px = self._held_out(moving, mapping, field, total)
-        is_used = _is_one_to_one(field, self.size_px) and held_out.p95_px <= _MAX_P95_GROWTH * before_p95_px
-        return DisplacementResult(field if is_used else None, before_p95_px, held_out.p95_px, held_out)
+        before, after = self._held_out(moving, mapping, field, total)
+        is_better = after.p95_px <= _MAX_P95_GROWTH * before.p95_px and is_decreased_beyond_chance(before, after)
+        is_used = is_better and _is_one_to_one(field, self.size_px)
+        return DisplacementResult(field if is_used else None, before.p95_px, after.p95_px, after)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
         """Measure the windows; their weights are relative to one with a noise of _NOISE_PX."""
@@ -102,8 +103,8 @@ class DisplacementEstimator:
 
     def _held_out(
         self, moving: Raster, mapping: PixelMapping, field: DisplacementField, total: Shifts
-    ) -> tuple[Residual, float]:
-        """Return the cross-validated residual of the verification windows, and their p95 without the field.
+    ) -> tuple[Residual, Residual]:
+        """Return the residuals of the verification windows without the field and, cross-validated, with it.
 
         The shifts are measured with the complete mapping, for which correlation is sharp. The total shift of each
         window is compared with a field fitted to windows that share no pixels with it.
@@ -114,7 +115,7 @@ class DisplacementEstimator:
         shifts_px = residual.shifts_px + field(residual.centres_px)
         given_px = 0.0 if mapping.field is None else mapping.field(residual.centres_px)
         before_px = np.where(np.isfinite(predicted_px), shifts_px - given_px, np.nan)  # in the same windows
-        return residual.with_shifts(shifts_px - predicted_px), residual.with_shifts(before_px).p95_px
+        return residual.with_shifts(before_px), residual.with_shifts(shifts_px - predicted_px)
 
     def _cross_predicted(self, shifts: Shifts, windows: Residual, min_distance_px: float) -> Points:
         """Predict the shifts (n, 2) of windows by fields fitted to the shifts of others at a minimum distance.
@@ -168,11 +169,6 @@ def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
     scale_px = 0.1  # several times the noise of a shift
     return np.asarray(np.log1p((lengths_px / scale_px) ** 2))
-
-
-def mean_in_standard_errors(decreases: NDArray[np.float64]) -> float:
-    """Return the mean of decreases (n,) relative to its standard error."""
-    return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
 
 
 def _near(centres_px: Points, others_px: Points, distance_px: float) -> NDArray[np.bool_]:

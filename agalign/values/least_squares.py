@@ -7,6 +7,7 @@ with respect to the parameters m. The prior of m has the mean m_0 and the inform
 by iteratively reweighted least squares with Cauchy weights (Holland & Welsch 1977).
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -95,3 +96,8 @@ def cauchy_weights(residuals: ArrayLike, scale: float | Array) -> Array:
     """
     ratio = np.asarray(residuals, dtype=np.float64) / scale
     return np.asarray(1 / (1 + ratio**2))
+
+
+def mean_in_standard_errors(values: Array) -> float:
+    """Return the mean of values (n,) relative to its standard error."""
+    return float(values.mean() / max(values.std() / math.sqrt(len(values)), 1e-12))

@@ -37,7 +37,7 @@ from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.residual import Residual, lengths_in_common_px
+from agalign.values.residual import Residual, _lengths_in_common_px
 
 from ..builders import grid_px, in_full_run, joint_result, residual_of, whole
 from ..conftest import Shared, textured_image
@@ -588,7 +588,7 @@ def test_shifts_are_compared_in_the_windows_that_both_residuals_have_measured() 
     measured = plane.cells[:, 0] > 2
     relief = plane.with_shifts(np.where(measured[:, None], plane.shifts_px / 2, np.nan))
     shuffled = relief.where(np.random.default_rng(0).permutation(len(relief.cells))[:200])
-    before, after = lengths_in_common_px(plane, shuffled)
+    before, after = _lengths_in_common_px(plane, shuffled)
     assert len(before) == np.isfinite(shuffled.shifts_px[:, 0]).sum() < 200
     np.testing.assert_allclose(after, before / 2)
 
