@@ -93,14 +93,13 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
     parts = [Residual(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
     with open_raster(moving.path, moving.page) as source:
-        for tile, windows in tiles:
+        for number, (tile, windows) in enumerate(tiles):
             # GDAL's block cache serves neighbouring tiles of the open file.
             warped = resample_tile(moving, mapping, tile, "lanczos", read=partial(read_tile, dataset=source))
             part = windows.residuals(_raster(*warped, moving))
-            origin_px = np.array([tile.x0, tile.y0])
-            centres_px = part.centres_px + origin_px
-            cells = (centres_px // windows.side).astype(np.int64)  # windows share no pixels, so each has its own
-            parts.append(replace(part, centres_px=centres_px, cells=cells))
+            # Each tile has its own columns of cells, from an even one: a chessboard of its windows.
+            origin_px, first_cell = np.array([tile.x0, tile.y0]), np.array([2 * _TILE_PX * number, 0])
+            parts.append(replace(part, centres_px=part.centres_px + origin_px, cells=part.cells + first_cell))
     return Residual.joined(parts)
 
 

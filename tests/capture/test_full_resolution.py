@@ -25,10 +25,12 @@ from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
 from agalign.fit import window_fit
 from agalign.flight.rig import distance_px
+from agalign.pixels.raster import open_raster
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import PairScales
+from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
 
@@ -101,6 +103,20 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")
     assert geometry.corner_error_px(result["red"].fixed_to_moving, TRUTH, *SIZE) < 0.2
     assert result["red"].residual.centres_px.max() > 700  # px of the file
+
+
+def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
+    """Adjacent windows have different colours wherever a tile is, and none have the same cell."""
+    reference, moving = capture.reference, capture.moving[0]
+    tiles = [Tile(30, 10, 610, 330), Tile(30, 450, 610, 330)]
+    with open_raster(reference.path, reference.page) as source:
+        chosen = [(tile, full_resolution._windows(source, reference, tile)) for tile in tiles]
+    residual = full_resolution._residual(moving, PixelMapping(TRUTH), chosen)
+    assert len(np.unique(residual.cells, axis=0)) == len(residual.cells) > 20
+    apart = np.abs(residual.centres_px[:, None] - residual.centres_px).sum(axis=2)
+    first, second = np.nonzero((apart > 0) & (apart < 1.5 * residual.spacing_px))  # neighbours in a row or a column
+    assert len(first) > 40
+    assert (residual.is_even_cell[first] != residual.is_even_cell[second]).all()
 
 
 def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture, pair: BandPair) -> None:
