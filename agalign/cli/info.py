@@ -175,10 +175,9 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     table = []
     for row in rows:
         (dx, dy), (bx, by) = row["offset_px"], row["baseline"]
-        lengths = ("pixel_size_px", "from_bands_px", "from_neighbours_px", "from_flight_px")
-        pixel, *errors = (f"{row[k]:.2f}" for k in lengths)
-        field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
-        table.append((row["band"], pixel, f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field))
+        lengths = ("pixel_size_px", "from_bands_px", "from_neighbours_px", "from_flight_px", "field_px")
+        pixel, *errors = ("none" if row[k] is None else f"{row[k]:.2f}" for k in lengths)
+        table.append((row["band"], pixel, f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors))
     title = "The rig: offset of each band, and error of its prediction (RMS, px of the band)"
     terminal.table((*headers, *of_errors, "Largest lens displacement"), table, title, texts=1)
     shared = ", ".join(factors) or "nothing"

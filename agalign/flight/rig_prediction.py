@@ -43,10 +43,11 @@ def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
 def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> float:
     """Return the RMS error of a band in captures without any known band.
 
-    They are predicted from the captures before and after (`by_neighbours`) or from the flight's mean.
+    They are predicted from the captures before and after (`by_neighbours`), NaN if the times of fewer than two are
+    known, or from the flight's mean.
     """
     squares = [square for _, square in _leave_one_out(rig, band, "seconds" if by_neighbours else "flight")]
-    return float(np.sqrt(np.mean(squares or [0.0]) + rig.from_bands_px[band] ** 2))
+    return math.sqrt(float(np.mean(squares)) + rig.from_bands_px[band] ** 2) if squares else math.nan
 
 
 def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
@@ -69,8 +70,14 @@ def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
 def band_summaries(rig: Rig) -> list[dict[str, Any]]:
     """Return the offset of the image centre, baseline, errors of predictions and displacements of each band.
 
-    Errors are in px of the band, the other lengths in px of the reference.
+    Errors are in px of the band, the other lengths in px of the reference. The error of a prediction by neighbours is
+    None if their times are unknown.
     """
+
+    def error_px(band: str, *, by_neighbours: bool) -> float | None:
+        error = unobserved_error_px(rig, band, by_neighbours=by_neighbours) * rig.magnification(band)
+        return None if math.isnan(error) else error
+
     centre = (np.array(rig.size_px, float) - 1) / 2
     field_px = {b: float(np.linalg.norm(f.displacements_px, axis=-1).max()) for b, f in rig.fields.items()}
     return [
@@ -80,8 +87,8 @@ def band_summaries(rig: Rig) -> list[dict[str, Any]]:
             "baseline": rig.baselines[band],
             "pixel_size_px": 1 / rig.magnification(band),
             "from_bands_px": rig.from_bands_px[band] * rig.magnification(band),
-            "from_neighbours_px": unobserved_error_px(rig, band, by_neighbours=True) * rig.magnification(band),
-            "from_flight_px": unobserved_error_px(rig, band, by_neighbours=False) * rig.magnification(band),
+            "from_neighbours_px": error_px(band, by_neighbours=True),
+            "from_flight_px": error_px(band, by_neighbours=False),
             "field_px": field_px.get(band),
         }
         for band, mean in rig.mean.items()
@@ -196,7 +203,8 @@ def _leave_one_out(rig: Rig, band: str, basis: Basis) -> list[tuple[float, float
 def _altitude_error_px(rig: Rig, altitude_m: float | None) -> float:
     """Return the error of the distance factor by the difference from the nearest altitude of the learned captures.
 
-    It is proportional to the slope of the factor, by linear regression with a prior, and the slope's standard error.
+    It is proportional to the slope of the factor and the slope's standard error, by linear regression with a prior of
+    mean 0: altitudes that hardly differ do not determine a slope.
     """
     known = np.array([(c.altitude_m, c.factors[0]) for c in rig.captures if c.altitude_m is not None])
     if altitude_m is None or len(known) < MIN_CAPTURES:
@@ -206,5 +214,6 @@ def _altitude_error_px(rig: Rig, altitude_m: float | None) -> float:
     min_scatter_px = 0.5  # around the regression
     scatter_px = max(float((y_px - slope * x_m).std()), min_scatter_px)
     prior_std_px_per_m = 1.5  # a baseline of 0.03 m, 20 m above the ground
-    slope_std = 1 / np.sqrt(1 / prior_std_px_per_m**2 + x_m @ x_m / scatter_px**2)
-    return float(np.abs(known[:, 0] - altitude_m).min() * (slope_std + abs(slope)))
+    information = x_m @ x_m / scatter_px**2
+    variance = 1 / (1 / prior_std_px_per_m**2 + information)
+    return float(np.abs(known[:, 0] - altitude_m).min() * (np.sqrt(variance) + abs(slope) * information * variance))

@@ -145,6 +145,13 @@ def test_an_unseen_altitude_increases_the_standard_error() -> None:
     assert at_90 > 2.0
 
 
+def test_altitudes_that_hardly_differ_determine_no_slope() -> None:
+    """Their differences and the noise of the distance would make it thousands of px per m."""
+    level = [replace(capture, altitude_m=100.0 + 1e-4 * k) for k, capture in enumerate(level_flight(5))]
+    at_90 = predict_band(learn_rig(level, SIZE, BASELINES), "NIR", Observation(2.5, {}, {}, 90.0)).std_px
+    assert 2.0 < at_90 < 10 * 1.5 * 1.1  # the prior, px per m
+
+
 DELAYS = {"Blue": 0.0, "Red": 0.4, "NIR": 1.0, "Red edge": 0.7}
 
 

@@ -1,5 +1,6 @@
 """Predictions of a simple rig: factors of a capture, and each term of the standard error separately."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -103,6 +104,9 @@ def test_errors_of_unobserved_captures() -> None:
     # Linear interpolation is exact between neighbours and constant at the ends.
     expected = np.sqrt(0.6**2 * (1 + 0 + 0 + 0 + 1) / 5 + FROM_BANDS_PX**2)
     assert unobserved_error_px(line, "Red", by_neighbours=True) == pytest.approx(expected)
+    without_times = rig(*(capture(float(k)) for k in range(5)))
+    assert math.isnan(unobserved_error_px(without_times, "Red", by_neighbours=True))
+    assert band_summaries(without_times)[0]["from_neighbours_px"] is None
 
 
 def distance_at(query: CaptureFactors, known: list[CaptureFactors]) -> tuple[float, float, float]:
