@@ -10,11 +10,11 @@ The estimators propose; `decide` chooses. For each band, the first row that appl
 | the seed                                  | it is trusted or requested, and fits the windows | `seed_only` |
 | the seed                                  | otherwise                                        | `failed`    |
 
-A capture has a relief if one fits half of its bands better than their homographies, and of several the one that
-delivers most bands: all bands of its reference image then have this geometry. (1) The candidate under it is `aligned`
-without issues, else `predicted`. (2) A candidate without issues is `aligned`, but beside a relief it is `predicted`, as
-indices would mix two geometries. Every standard error is the RMS of `Candidate.error`. `Alignment.status` follows from
-the issues and the prediction that are set here.
+A capture has a relief if one fits half of the bands that it is estimated from better than their homographies, and of
+several the one that delivers most bands: all bands of its reference image then have this geometry. (1) The candidate
+under it is `aligned` without issues, else `predicted`. (2) A candidate without issues is `aligned`, but beside a relief
+it is `predicted`, as indices would mix two geometries. Every standard error is the RMS of `Candidate.error`.
+`Alignment.status` follows from the issues and the prediction that are set here.
 
 The prediction of the rig of the flight replaces what contradicts it, seeds, what has failed, and predictions that are
 less certain or show another scene in a part of the image. An image that is rotated or scaled relative to its rig does
@@ -36,28 +36,23 @@ def decide(
     bands: Sequence[BandCandidates],
     reliefs: Sequence[ReliefCandidates] = (),
     predictions: Mapping[str, RigPrediction] | None = None,
-    delivered_std_px: float = DELIVERED_STD_PX,
 ) -> Alignments:
     """Return the alignments of the bands of a capture by name, px of the images.
 
-    `predictions` are those of the rig by band; a predicted band is delivered with a standard error of at most
-    `delivered_std_px`, px of the band.
+    `predictions` are those of the rig by band.
     """
     predictions = predictions or {}
-    return _aligned(bands, _chosen_relief(bands, reliefs, predictions, delivered_std_px), predictions)
+    return _aligned(bands, _chosen_relief(bands, reliefs, predictions), predictions)
 
 
 def _chosen_relief(
-    bands: Sequence[BandCandidates],
-    reliefs: Sequence[ReliefCandidates],
-    predictions: Mapping[str, RigPrediction],
-    delivered_std_px: float,
+    bands: Sequence[BandCandidates], reliefs: Sequence[ReliefCandidates], predictions: Mapping[str, RigPrediction]
 ) -> ReliefCandidates | None:
-    """The relief of the capture; None if no relief fits half of the bands."""
+    """The relief of the capture; None if no relief fits half of its bands."""
     fitting = [relief for relief in reliefs if relief.fits_better]
 
     def delivered(relief: ReliefCandidates) -> int:
-        return sum(a.is_usable(delivered_std_px) for a in _aligned(bands, relief, predictions).values())
+        return sum(a.is_usable(DELIVERED_STD_PX) for a in _aligned(bands, relief, predictions).values())
 
     return max(fitting, key=delivered) if len(fitting) > 1 else next(iter(fitting), None)
 

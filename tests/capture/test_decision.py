@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from agalign.capture import decision
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import ReliefCandidates
 from agalign.capture.by_rig import RigPrediction
@@ -219,8 +220,8 @@ class Together:
         default_factory=lambda: {n: BandCandidates(pair(n), SEED, None, [candidate(n)]) for n in ("Blue", "Red", "NIR")}
     )
 
-    def decided(self, *reliefs: ReliefCandidates, delivered_std_px: float = np.inf) -> dict[str, Alignment]:
-        return decide(list(self.bands.values()), reliefs, None, delivered_std_px)
+    def decided(self, *reliefs: ReliefCandidates) -> dict[str, Alignment]:
+        return decide(list(self.bands.values()), reliefs)
 
 
 def relief_of(*names: str, fits_better: bool = True, predicted: Mapping[str, float] | None = None) -> ReliefCandidates:
@@ -276,19 +277,22 @@ def test_a_band_under_the_relief_is_predicted_with_the_error_of_the_relief() -> 
     ],
 )
 def test_of_two_reliefs_the_one_that_delivers_more_bands_is_that_of_all(
-    first: tuple[str, ...], second: tuple[str, ...], delivered_std_px: float, chosen: int
+    first: tuple[str, ...],
+    second: tuple[str, ...],
+    delivered_std_px: float,
+    chosen: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(decision, "DELIVERED_STD_PX", delivered_std_px)
     reliefs = [relief_of(*names) for names in (first, second)]
-    result = Together().decided(*reliefs, delivered_std_px=delivered_std_px)
+    result = Together().decided(*reliefs)
     used = {id(a.mapping.parallax.relief) for a in result.values() if a.mapping.parallax is not None}
     assert used == {id(c.mapping.parallax.relief) for c in reliefs[chosen].candidates.values()}
 
 
 def test_a_relief_that_fits_worse_is_no_option() -> None:
     """Even if it would deliver more bands."""
-    result = Together().decided(
-        relief_of("Blue", "Red", "NIR", fits_better=False), relief_of("Blue"), delivered_std_px=0
-    )
+    result = Together().decided(relief_of("Blue", "Red", "NIR", fits_better=False), relief_of("Blue"))
     assert {name: a.geometry for name, a in result.items()} == {
         "Blue": "relief",
         "Red": "homography",
