@@ -106,7 +106,7 @@ class _Band:
     plane: PixelMapping
     baseline: tuple[float, float] = (0.0, 0.0)
     covariance_px2: NDArray[np.float64] | None = None
-    """(8, 8) of the corners of the plane; None before it is fitted."""
+    """(8, 8) of the corners of the plane, or (12, 12) with the lens shapes; None before it is fitted."""
 
     @property
     def name(self) -> str:
@@ -121,16 +121,14 @@ class _Band:
     def fitted(self, fit: WindowFit) -> "_Band":
         """Apply a fit to windows. Raises GeometryError."""
         x, y = self.baseline if fit.baseline is None else fit.baseline.tolist()
-        return replace(
-            self, plane=fit.applied_to(self.plane), baseline=(x, y), covariance_px2=fit.covariance_px2[:8, :8]
-        )
+        return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y), covariance_px2=fit.covariance_px2)
 
     @property
     def joint(self) -> JointResult:
         """The result with the homography of the plane, which is fitted to windows and verified with others."""
         assert self.covariance_px2 is not None
         joint = replace(self.refined.joint, recipe=BY_WINDOWS)
-        return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
+        return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2[:8, :8])
 
     @cached_property
     def by_homography(self) -> Residual:
@@ -147,7 +145,8 @@ class _Band:
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
         pair, windows = self.refined.pair, held_out.residual
-        error = mapping_error(pair, mapping, self.joint.covariance_px2, windows, self.plane.field)
+        assert self.covariance_px2 is not None
+        error = mapping_error(pair, mapping, self.covariance_px2, windows, self.plane.field)
         return Candidate(pair, mapping, error, windows, self.joint, held_out, held_out_p95_px=p95_px)
 
 
@@ -298,8 +297,7 @@ class _Estimate:
         fitted = fit_in_rounds(start, band.relief_fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None
-        baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]
-        return _Band(band, fitted[0].without_parallax, baseline, covariance_px2)
+        return _Band(band, fitted[0].without_parallax, fitted[0].parallax.baseline, fitted[1].covariance_px2)
 
     def of_other_bands(self, others: Sequence[RefinedBand]) -> dict[str, Candidate]:
         """Return the candidates of bands of the same reference where windows allow it, except those of the estimate: a
