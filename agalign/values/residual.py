@@ -21,11 +21,10 @@ _NOISE_PX_SIGMA2 = 48.0
 of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
 
 
-_TOLERATED_NOISE = 1 / 75
-"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 1.5 px for windows of 112
-px, 0.4 px for those of 64 px that overlap by half. In images with 30 % of noise, the error by windows without weights
-is up to five times that at tie points. With 1/150, a blurred band passes whose error is above 1 px at a tenth of the
-tie points: low peaks of blurred images are not noise alone."""
+_TOLERATED_NOISE = 1 / 150
+"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 0.75 px for windows of 112
+px, 0.2 px for those of 64 px that overlap by half. In images with 30 % of noise, the error by windows without weights
+is up to five times that at tie points."""
 
 
 def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
@@ -179,7 +178,7 @@ def is_decreased_beyond_chance(before: Residual, after: Residual) -> bool:
     It is the mean decrease of log(1 + (length / 0.3 px)^2), which is robust to wrong peaks; their windows are of one
     grid. The p95 alone is that of wrong peaks where images are noisy.
     """
-    # Standard errors: at most 3.0 with the relief of flat scenes with noise and 3.9 with fields of blurred ones; at least
+    # Standard errors: at most 3.0 with reliefs of flat scenes with noise, and 3.9 with fields of blurred ones; at least
     # 5.4 with boxes, booms, trees and leaves, and 5.9 with the lens shapes of a dual camera.
     min_sigma, scale_px = 4.0, 0.3
     before_px, after_px = _lengths_in_common_px(before, after)
