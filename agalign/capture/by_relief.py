@@ -48,7 +48,7 @@ from agalign.values.image import FloatImage
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual, is_decreased_beyond_chance
-from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
+from agalign.verify.checks import BY_PARALLAX, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -317,14 +317,15 @@ class _Estimate:
     def candidate(self, band: _Band, held_out: WarpedPair) -> dict[str, Candidate]:
         """Return the candidate of a band by the relief of all bands, with its name, and with its held-out windows.
 
-        Empty if the checks find issues, and the windows are few, half of them are not aligned, or the scene repeats.
+        Empty if the checks find issues, and the candidate may not predict, its windows are few, or half of them are not
+        aligned.
         """
         mapping = band.mapping(self.relief, with_occlusions=True)
         candidate = band.candidate(mapping, held_out)
         windows = candidate.windows
         is_known = len(windows.measured_px) >= MIN_WINDOWS
         is_known &= windows.median_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px
-        if not candidate.issues or (is_known and held_out.alias_peak().ratio <= MAX_ALIAS_PEAK):
+        if not candidate.issues or (is_known and candidate.may_predict):
             return {band.name: candidate}
         return {}
 

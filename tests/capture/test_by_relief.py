@@ -33,7 +33,7 @@ from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix, PairScales
 from agalign.values.image import Raster
-from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
+from agalign.values.issues import CLOSE_WINDOWS, NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
@@ -406,7 +406,7 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     found = Candidate.issues.func
 
     def with_nir_failed(candidate: Candidate) -> tuple[Issue, ...]:
-        return (Issue(RETRIEVAL),) if candidate.pair.name == "NIR" else found(candidate)
+        return (Issue(CLOSE_WINDOWS),) if candidate.pair.name == "NIR" else found(candidate)
 
     monkeypatch.setattr(Candidate, "issues", property(with_nir_failed))
     result = aligned_by_relief(candidates, "auto")[0]
