@@ -50,7 +50,7 @@ def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus 
     if status in ("aligned", "predicted"):
         rig_std_px = 0.4 / geometry.magnification(mapping.fixed_to_moving, *size_px) if prediction else 0.0
         windows = None if prediction else facts.get("residual")
-        error = MappingError(size_px, windows=windows, rig_std_px=rig_std_px, parallax=mapping.parallax)
+        error = MappingError(size_px, residual=windows, rig_std_px=rig_std_px, parallax=mapping.parallax)
     evidence = {"issues": issues, "prediction": prediction, "is_seed_usable": status == "seed_only"}
     evidence |= {} if error is None else {"error": error, "std_px": error.rms_px(geometry.lattice(*size_px, 24, 18))}
     facts = {**evidence, "seed": Seed("rig", mapping.fixed_to_moving, 30.0, 30.0, 5.0)} | facts

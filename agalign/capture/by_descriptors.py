@@ -46,7 +46,7 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of(displaced, joint, displacement.held_out)
-    with_field = replace(held_out, other_windows=displaced.residual, held_out_p95_px=p95_px)
+    with_field = replace(held_out, other_residual=displaced.residual, held_out_p95_px=p95_px)
     yield without if with_field.issues and not plane.issues else with_field
 
 

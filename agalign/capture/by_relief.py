@@ -144,10 +144,10 @@ class _Band:
         """Return the candidate by a mapping with a relief; its windows are held out, under a relief of other bands."""
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
-        pair, windows = self.refined.pair, held_out.residual
+        pair, residual = self.refined.pair, held_out.residual
         assert self.covariance_px2 is not None
-        error = mapping_error(pair, mapping, self.covariance_px2, windows, self.plane.field)
-        return Candidate(pair, mapping, error, windows, self.joint, held_out, held_out_p95_px=p95_px)
+        error = mapping_error(pair, mapping, self.covariance_px2, residual, self.plane.field)
+        return Candidate(pair, mapping, error, residual, self.joint, held_out, held_out_p95_px=p95_px)
 
 
 def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
@@ -322,9 +322,9 @@ class _Estimate:
         """
         mapping = band.mapping(self.relief, with_occlusions=True)
         candidate = band.candidate(mapping, held_out)
-        windows = candidate.windows
-        is_known = len(windows.measured_px) >= MIN_WINDOWS
-        is_known &= windows.median_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px
+        residual = candidate.residual
+        is_known = len(residual.measured_px) >= MIN_WINDOWS
+        is_known &= residual.median_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px
         if not candidate.issues or (is_known and candidate.may_predict):
             return {band.name: candidate}
         return {}
@@ -338,7 +338,7 @@ def _with_field(candidate: Candidate) -> Candidate:
         return candidate
     assert candidate.error.covariance_px2 is not None
     with_field = replace(mapping, field=displacement.field)
-    error = mapping_error(pair, with_field, candidate.error.covariance_px2, candidate.windows, mapping.field)
+    error = mapping_error(pair, with_field, candidate.error.covariance_px2, candidate.residual, mapping.field)
     p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.after_p95_px}
     return replace(candidate, mapping=with_field, error=error, held_out_p95_px=p95_px)
 
@@ -353,7 +353,7 @@ def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> boo
         candidate, plane = result.get(band.name), band.by_homography
         if candidate is None or (candidate.issues and plane.p95_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px):
             return False
-        return _decreases_shifts(plane, candidate.windows)
+        return _decreases_shifts(plane, candidate.residual)
 
     return 2 * sum(map(is_better, bands)) >= len(bands)
 

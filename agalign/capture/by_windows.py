@@ -97,7 +97,7 @@ def is_extrapolated(plane: Candidate) -> bool:
     if [issue.kind for issue in plane.issues] != [INACCURATE] or plane.mapping.parallax is not None:
         return False
     in_frame_px = points_in_frame(plane.mapping, *pair.sizes_px)
-    unobserved = unobserved_quarters(plane.windows.measured_px, pair.fixed.size_px, in_frame_px)
+    unobserved = unobserved_quarters(plane.residual.measured_px, pair.fixed.size_px, in_frame_px)
     return not pair.is_georeferenced and bool(unobserved)
 
 

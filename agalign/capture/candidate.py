@@ -29,7 +29,7 @@ class Candidate:
     pair: BandPair
     mapping: PixelMapping
     error: MappingError
-    windows: Residual
+    residual: Residual
     """Windows without their own part in the fit, under the mapping without a displacement field, which other held-out
     windows verify: descriptors and rig contribute to each half. Lens shapes are fitted to them: such a candidate only
     predicts.
@@ -38,7 +38,7 @@ class Candidate:
     """Evidence of descriptors or windows; None for a prediction by the rig."""
     images: WarpedPair | None = None
     """The images under the mapping, with the relief of other bands if it has one; None omits checks that use pixels."""
-    other_windows: Residual | None = None
+    other_residual: Residual | None = None
     """More windows, which also have to pass the checks: those of another size, in which the mapping was not chosen."""
     held_out_p95_px: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
@@ -50,13 +50,13 @@ class Candidate:
     """Issues of an earlier candidate that remain: it is a prediction, as windows see a part of the image only."""
 
     @classmethod
-    def of(cls, warped: WarpedPair, joint: JointResult, windows: Residual | None = None) -> "Candidate":
+    def of(cls, warped: WarpedPair, joint: JointResult, residual: Residual | None = None) -> "Candidate":
         """Return the candidate with the homography and covariance of a result, and with the mapping of `warped`, whose
         windows verify it unless others are given.
         """
-        windows = warped.residual if windows is None else windows
-        error = mapping_error(warped.pair, warped.mapping, joint.covariance_px2, windows)
-        return cls(warped.pair, warped.mapping, error, windows, joint, warped)
+        residual = warped.residual if residual is None else residual
+        error = mapping_error(warped.pair, warped.mapping, joint.covariance_px2, residual)
+        return cls(warped.pair, warped.mapping, error, residual, joint, warped)
 
     @cached_property
     def issues(self) -> tuple[Issue, ...]:
@@ -64,13 +64,13 @@ class Candidate:
         if self.inherited_issues:
             return self.inherited_issues
         pixel_px = self.pair.file_pixel_size_px
-        found = issues_of(self.mapping, self.error, self.windows, self.joint, self.checked_px, pixel_px)
+        found = issues_of(self.mapping, self.error, self.residual, self.joint, self.checked_px, pixel_px)
         found = found or self._issues_of_pixels
         issues = tuple(issue for issue in found if issue.kind not in self.ignored)
-        if issues or self.other_windows is None:
+        if issues or self.other_residual is None:
             return issues
-        error = replace(self.error, windows=self.other_windows)
-        return replace(self, windows=self.other_windows, error=error, other_windows=None).issues
+        error = replace(self.error, residual=self.other_residual)
+        return replace(self, residual=self.other_residual, error=error, other_residual=None).issues
 
     @cached_property
     def _issues_of_pixels(self) -> tuple[Issue, ...]:
@@ -87,11 +87,11 @@ class Candidate:
     def std_px(self) -> float:
         """Standard error: the RMS of the expected error over the common area, px of the fixed image."""
         if self.pair.is_georeferenced:
-            return self.error.rms_px(self.common_px if len(self.common_px) else self.windows.centres_px)
+            return self.error.rms_px(self.common_px if len(self.common_px) else self.residual.centres_px)
         size_px = self.pair.fixed.size_px
         is_common = pixels_in_frame(self.mapping, *self.pair.sizes_px)
         if not is_common.any():
-            return self.error.rms_px(self.windows.centres_px)
+            return self.error.rms_px(self.residual.centres_px)
         error_px = ErrorOnGrid.of(self.error, size_px).on_tile(Tile(0, 0, *size_px))[is_common]
         return float(np.sqrt(np.square(error_px).mean(dtype=np.float64)))
 
@@ -114,14 +114,14 @@ class Candidate:
         """Points (n, 2) whose errors are limited: those of the windows under a relief, whose error at a pixel without
         texture no image shows; without one, the error is smooth, and the whole common area counts.
         """
-        return self.common_px if self.mapping.parallax is None else self.windows.centres_px
+        return self.common_px if self.mapping.parallax is None else self.residual.centres_px
 
 
 def mapping_error(
     pair: BandPair,
     mapping: PixelMapping,
     covariance_px2: NDArray[np.float64],
-    windows: Residual,
+    residual: Residual,
     lens_field: DisplacementField | None = None,
     *,
     relief_std_px: float | None = None,
@@ -133,15 +133,15 @@ def mapping_error(
     `lens_field`, by default that of the rig, continues by chance where no window is near.
     """
     spread_px, lens_field = 0.0, pair.field if lens_field is None else lens_field
-    if mapping.field is not None and windows.is_measured.any():
-        displacements_px = mapping.field(windows.measured_px)
+    if mapping.field is not None and residual.is_measured.any():
+        displacements_px = mapping.field(residual.measured_px)
         if lens_field is not None:
-            displacements_px = displacements_px - lens_field(windows.measured_px)
+            displacements_px = displacements_px - lens_field(residual.measured_px)
         spread_px = float(np.sqrt(displacements_px.var(axis=0).sum()))
     return MappingError(
         pair.fixed.size_px,
         covariance_px2,
-        windows,
+        residual,
         lens_std_px=pair.unknown_lens_std_px if len(covariance_px2) == 8 else None,
         field_std_px=spread_px,
         relief_std_px=(

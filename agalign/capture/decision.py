@@ -107,7 +107,7 @@ class _Choice:
             self.issues,
             band.start,
             joint=band.joint if chosen.joint is None else chosen.joint,
-            residual=chosen.windows,
+            residual=chosen.residual,
             held_out_p95_px={**p95_px, **chosen.held_out_p95_px},
             prediction=_prediction(chosen, self.compared) if self.issues else self.compared,
             error=chosen.error,

@@ -43,7 +43,7 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     """
     pair = band.pair
     up = pair.scales.fixed.inverse, pair.scales.moving.inverse
-    residual, mapping = start.windows.in_file_px(pair.scales), start.mapping.rescaled(*up)
+    residual, mapping = start.residual.in_file_px(pair.scales), start.mapping.rescaled(*up)
     with open_raster(reference.path, reference.page) as source:
         chosen = [(tile, _windows(source, reference, tile)) for tile in _tiles(residual, reference.size_px)]
     max_moved_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
@@ -56,9 +56,9 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     down, scale = fitted.mapping.rescaled(pair.scales.fixed, pair.scales.moving), pair.scales.fixed
     factors = np.tile(scale, 4)
     joint = start.joint.with_homography(down.fixed_to_moving, fitted.fit.covariance_px2 * np.outer(factors, factors))
-    windows = fitted.held_out.rescaled(scale)
-    error = mapping_error(pair, down, joint.covariance_px2, windows)
-    return Candidate(pair, down, error, windows, joint, refined_from=start)
+    held_out = fitted.held_out.rescaled(scale)
+    error = mapping_error(pair, down, joint.covariance_px2, held_out)
+    return Candidate(pair, down, error, held_out, joint, refined_from=start)
 
 
 def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:

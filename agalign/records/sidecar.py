@@ -261,10 +261,10 @@ class ErrorPart(_Part):
             return None
         return cls(std_px=alignment.std_px, std_band_px=alignment.std_band_px, **_values(error, _SAME_IN_ERROR))
 
-    def mapping_error(self, size_px: Size, windows: Residual | None, parallax: Parallax | None) -> MappingError:
-        """Return the error of a mapping of a reference (width, height), with the windows and parallax of the band."""
-        windows = None if self.covariance_px2 is None else windows
-        return MappingError(size_px, windows=windows, parallax=parallax, **_values(self, _SAME_IN_ERROR))
+    def mapping_error(self, size_px: Size, residual: Residual | None, parallax: Parallax | None) -> MappingError:
+        """Return the error of a mapping of a reference (width, height), with the residual and parallax of the band."""
+        residual = None if self.covariance_px2 is None else residual
+        return MappingError(size_px, residual=residual, parallax=parallax, **_values(self, _SAME_IN_ERROR))
 
 
 class PlacePart(_Part):

@@ -53,7 +53,7 @@ class MappingError:
     >>> error = result.error
     >>> error.size_px, error.covariance_px2.shape, error.rig_std_px, error.parallax
     ((200, 200), (8, 8), 0.0, None)
-    >>> error.windows.coverage, error.lens_std_px is None, error.field_std_px < 0.1, error.relief_std_px
+    >>> error.residual.coverage, error.lens_std_px is None, error.field_std_px < 0.1, error.relief_std_px
     (1.0, False, True, 0.0)
     """
 
@@ -62,7 +62,7 @@ class MappingError:
     covariance_px2: NDArray[np.float64] | None = None
     """C: covariance of the corners (8, 8), clockwise from the top left, x and y in turn, or with the lens shapes
     (12, 12); None for a prediction by other bands or captures."""
-    windows: Residual | None = None
+    residual: Residual | None = None
     """Shifts of windows that the fit did not use, under the mapping; None if they say nothing about it."""
     rig_std_px: float = 0.0
     """Standard error of a prediction by other bands or captures, the same everywhere."""
@@ -146,7 +146,7 @@ class MappingError:
             self,
             size_px=size_px,
             covariance_px2=_scaled(self.covariance_px2, per_axis),
-            windows=None if self.windows is None else self.windows.in_file_px(scales),
+            residual=None if self.residual is None else self.residual.in_file_px(scales),
             rig_std_px=self.rig_std_px * up.mean,
             lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
             field_std_px=self.field_std_px * up.mean,
@@ -158,13 +158,13 @@ class MappingError:
     @cached_property
     def _measured(self) -> Residual | None:
         """The windows with a measured shift; None without any."""
-        if self.windows is None or not self.windows.is_measured.any():
+        if self.residual is None or not self.residual.is_measured.any():
             return None
-        return self.windows.where(self.windows.is_measured)
+        return self.residual.where(self.residual.is_measured)
 
     @cached_property
     def _spacing_px(self) -> float:
-        return 1.0 if self.windows is None else self.windows.spacing_px
+        return 1.0 if self.residual is None else self.residual.spacing_px
 
     @cached_property
     def _tree(self) -> cKDTree:

@@ -67,22 +67,22 @@ PREDICTED_WITH = frozenset({*BY_PARALLAX, OTHER_CONTENT})
 def issues_of(
     mapping: PixelMapping,
     error: MappingError,
-    windows: Residual,
+    residual: Residual,
     joint: JointResult | None,
     checked_px: Points,
     pixel_px: float = 1.0,
 ) -> tuple[Issue, ...]:
     """Return every reason for not accepting a mapping of a reference, without its pixels; empty if it passes.
 
-    The first issue is the reason in the sidecar. `windows` are measured with the mapping, `joint` is the evidence of
+    The first issue is the reason in the sidecar. `residual` is measured with the mapping, `joint` is the evidence of
     descriptors, and `checked_px` (n, 2) are the points whose errors are limited. `pixel_px` is the size of a pixel of
     the reference's file on this grid: limits of shifts and errors are in px of the file.
     """
     return (
         *_mapping_issues(mapping.fixed_to_moving, error.size_px),
-        *_descriptor_issues(joint, windows),
-        *_window_issues(windows, pixel_px),
-        *_error_issues(error, windows, checked_px, pixel_px),
+        *_descriptor_issues(joint, residual),
+        *_window_issues(residual, pixel_px),
+        *_error_issues(error, residual, checked_px, pixel_px),
     )
 
 
@@ -134,7 +134,7 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
     return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
 
 
-def _error_issues(error: MappingError, windows: Residual, checked_px: Points, pixel_px: float) -> Iterator[Issue]:
+def _error_issues(error: MappingError, residual: Residual, checked_px: Points, pixel_px: float) -> Iterator[Issue]:
     """Check the expected error over the common area.
 
     A relief comes from other bands, so its error is small even where this band shows a different scene. Under a relief,
@@ -145,8 +145,8 @@ def _error_issues(error: MappingError, windows: Residual, checked_px: Points, pi
     share = float((error.error_px(checked_px) <= _MAX_ERROR_PX * pixel_px).mean())
     if not share >= _MIN_ACCURATE_SHARE:
         yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
-    if error.parallax is not None and not windows.coverage >= _MIN_ACCURATE_SHARE:
-        yield Issue(UNMEASURED, 1 - windows.coverage, 1 - _MIN_ACCURATE_SHARE)
+    if error.parallax is not None and not residual.coverage >= _MIN_ACCURATE_SHARE:
+        yield Issue(UNMEASURED, 1 - residual.coverage, 1 - _MIN_ACCURATE_SHARE)
 
 
 def content_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:

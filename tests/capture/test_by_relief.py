@@ -553,7 +553,7 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     """Half of the bands decide; a band that no relief explains counts as one that it does not fit."""
     plane, relief = (windows_with(*px) for px in (plane_px, relief_px))
     bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
-    aligned = SimpleNamespace(issues=(), windows=relief, pair=SimpleNamespace(file_pixel_size_px=1.0))
+    aligned = SimpleNamespace(issues=(), residual=relief, pair=SimpleNamespace(file_pixel_size_px=1.0))
     predicted = SimpleNamespace(**vars(aligned) | {"issues": (Issue(RETRIEVAL),)})
     assert _fits_better(bands[:1], {"Blue": aligned}) == is_chosen
     assert _fits_better(bands, {"Blue": aligned, "Red": aligned}) == is_chosen

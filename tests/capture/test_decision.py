@@ -347,7 +347,7 @@ def test_the_rig_replaces_what_contradicts_it_and_what_is_less_certain(
     assert result.prediction.std_px == pytest.approx(rms_error_px(result), abs=6e-5)
     if source == "bands":
         assert result.prediction.std_px == 0.3
-        assert result.error.windows is None
+        assert result.error.residual is None
     if codes == ["unexpected_px"]:
         assert result.issues[0].value == result.prediction.off_px == pytest.approx(25.2)
 

@@ -269,7 +269,7 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
     shifts = np.where(centres[:, :1] < 160, 3.0, 0.0) * np.ones(2)
     cells = (centres // 80).astype(int)
     residual = Residual(centres, shifts, np.full(len(centres), 50.0), cells)
-    seed, error = Seed("rig", np.eye(3), 9.0), MappingError(size_px, windows=residual)
+    seed, error = Seed("rig", np.eye(3), 9.0), MappingError(size_px, residual=residual)
     alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), seed, residual=residual, error=error)
     reference, grid = Band("Green", Path("a.tif"), 1, *size_px, "uint16"), OutputGrid(0, 0, *size_px)
     share = share_over_1_px(alignment, reference, grid)
