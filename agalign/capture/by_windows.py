@@ -31,7 +31,9 @@ altitude, plants and booms at a metre."""
 
 
 def fitted_to_windows(band: BandCandidates) -> Candidate | None:
-    """Return the candidate by windows alone; None if the descriptors have a result, or if windows determine none."""
+    """Return the candidate by windows alone; None if the descriptors of a sharp band have a result, if its seed does
+    not fit the windows, or if these determine none.
+    """
     pair = band.pair
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}

@@ -83,7 +83,9 @@ class _Table:
         """(bands, 2) baselines of the known lens layout, of norm 1 together; None if unknown."""
 
     def selected_factors(self, apply: EachFactors) -> tuple[Factors, Array]:
-        """Return the factors with the smallest cross-validated errors, and these errors (bands,)."""
+        """Return the first set of factors that no later one improves on by a tenth, and its cross-validated errors
+        (bands,).
+        """
         candidates = _FACTOR_SETS if len(self.median) > 1 else _FACTOR_SETS[:1]
         (factors, errors_px), *others = zip(candidates, apply(self.cross_validated_px, candidates), strict=True)
         for candidate, candidate_px in others:

@@ -150,7 +150,7 @@ def estimated_factors(
 def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[Captures, Array]:
     """Return captures with the factors that they would have at an image motion, and the flight's mean (5,).
 
-    w is a linear function of the motion. If motions are unknown, the captures are unchanged.
+    w is a linear function of the motion. If motions are unknown, the captures are unchanged, and the mean is 0.
     """
     known = [c for c in captures if c.motion is not None]
     if motion is None or len(known) < MIN_CAPTURES:
