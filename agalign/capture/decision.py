@@ -156,8 +156,8 @@ def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:
     # Windows of another scene contribute to the mapping of the band, but not to the rig's.
     is_mixed = any(issue.kind == OTHER_CONTENT for issue in choice.issues)
     if own is not None and not is_mixed:
-        is_near = of_rig.distance_px(own.mapping.fixed_to_moving) <= MAX_UNEXPECTED_PX
-        if is_near and own.std_px <= of_rig.candidate.std_px:
+        near = replace(of_rig.of_plane, off_px=of_rig.distance_px(own.mapping.fixed_to_moving))
+        if not any(rig_issues(near)) and own.std_px <= of_rig.candidate.std_px:
             return choice
     if of_rig.rotated is not None:
         unexpected = Issue(UNEXPECTED_PX, of_rig.distance_px(of_rig.rotated), MAX_UNEXPECTED_PX)

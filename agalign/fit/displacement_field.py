@@ -23,7 +23,7 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.least_squares import cauchy_weights, mean_in_standard_errors, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.residual import Residual, is_decreased_beyond_chance, noise_px
+from agalign.values.residual import Residual, decrease_in_standard_errors, noise_px
 
 _FIELD_WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
@@ -42,6 +42,9 @@ _SMOOTHNESS = 0.4
 _NOISE_PX / sqrt(_SMOOTHNESS) = 0.19 px. With 2, errors at ties are a sixth larger on three scenes."""
 _MAX_P95_GROWTH = 1.05
 """Maximum ratio of the p95 of held-out windows with a field to that without it, as the p95 is noisy."""
+_MIN_DECREASE = 2.0
+"""Minimum decrease of the shifts of held-out windows by a field, in standard errors. A field that follows noise
+increases them: at most 0.9 in flat or already corrected bands, at least 2.2 with lens shapes and leaves."""
 _FOLDS = 4
 """Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
 
@@ -91,7 +94,8 @@ class DisplacementEstimator:
                 break
         assert field is not None
         before, after = self._held_out(moving, mapping, field, total)
-        is_better = after.p95_px <= _MAX_P95_GROWTH * before.p95_px and is_decreased_beyond_chance(before, after)
+        is_better = after.p95_px <= _MAX_P95_GROWTH * before.p95_px
+        is_better &= decrease_in_standard_errors(before, after) >= _MIN_DECREASE
         is_used = is_better and _is_one_to_one(field, self.size_px)
         return DisplacementResult(field if is_used else None, before.p95_px, after.p95_px, after)
 

@@ -83,8 +83,8 @@ class _Table:
         """(bands, 2) baselines of the known lens layout, of norm 1 together; None if unknown."""
 
     def selected_factors(self, apply: EachFactors) -> tuple[Factors, Array]:
-        """Return the first set of factors that no later one improves on by a tenth, and its cross-validated errors
-        (bands,).
+        """Return a set of factors and its cross-validated errors (bands,): a set replaces the one before it if its
+        errors are smaller by a tenth.
         """
         candidates = _FACTOR_SETS if len(self.median) > 1 else _FACTOR_SETS[:1]
         (factors, errors_px), *others = zip(candidates, apply(self.cross_validated_px, candidates), strict=True)

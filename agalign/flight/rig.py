@@ -95,8 +95,8 @@ class Rig:
     from_bands_px: Mapping[str, float]
     """RMS error by band of predictions from the other bands, in captures that were left out."""
     extrapolation_px: Mapping[str, float] = field(default_factory=dict)
-    """RMS error by band of the mean mapping, for bands without an observed quarter of the image, into which the
-    homography extrapolates differences of lens distortion."""
+    """RMS error by band of the mean mapping, for bands with parts of the image that no window observes, into which the
+    homography extrapolates unknown lens shapes."""
     parallax_px: Mapping[str, float] = field(default_factory=dict)
     """RMS displacement by band by the reliefs of the captures, which a homography does not contain."""
     fields: Mapping[str, DisplacementField] = field(default_factory=dict)
@@ -123,7 +123,7 @@ class Rig:
         return geometry.magnification(self.mean[band], *self.size_px)
 
     def covers(self, band: str) -> bool:
-        """Return True if the mapping of the band was observed in all parts of the image."""
+        """Return True if windows in all parts of the image determine the lens of the band."""
         return band in self.mean and band not in self.extrapolation_px
 
 

@@ -169,14 +169,15 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Pre
     """Predict a band from the estimate of the capture's factors with the smallest standard error, px.
 
     That is the leave-one-out error of the basis for learned captures with similar gaps, or the difference between
-    the captures used if that is larger.
+    the captures used if that is larger. A gap that is larger than those of all learned captures is not validated: the
+    flight's mean remains.
     """
     min_for_altitude = 6  # with fewer captures, the basis with the smallest error would be selected by chance
     max_gap_ratio = 2.0  # an estimate is validated on captures with at most this ratio to its gap
     design, results = rig.design(band), []
     for basis in get_args(Basis)[: 3 if len(rig.captures) >= min_for_altitude else 2]:
         estimate, tests = estimated_factors(known, rig.captures, basis), _leave_one_out(rig, band, basis)
-        if estimate is not None and tests:
+        if estimate is not None and tests and estimate[2] <= max_gap_ratio * tests[-1][0]:
             factors, std, gap = estimate
             similar = [square for other_gap, square in tests if other_gap <= max_gap_ratio * gap]
             squares = similar if len(similar) >= MIN_CAPTURES else [square for _, square in tests[:MIN_CAPTURES]]

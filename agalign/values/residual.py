@@ -21,10 +21,11 @@ _NOISE_PX_SIGMA2 = 48.0
 of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
 
 
-_TOLERATED_NOISE = 1 / 150
-"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 0.75 px for windows of 112
-px, 0.2 px for those of 64 px that overlap by half. In images with 30 % of noise, the error by windows without weights
-is up to five times that at tie points."""
+_TOLERATED_NOISE = 1 / 100
+"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 1.1 px for windows of 112
+px, 0.3 px for those of 64 px that overlap by half. In images with 30 % of noise, the error by windows without weights
+is up to five times that at tie points. With 1/150, a blurred band passes whose error is above 1 px at a tenth of the
+tie points: low peaks of blurred images are not noise alone."""
 
 
 def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
@@ -172,20 +173,16 @@ def square_weights(residual: Residual) -> NDArray[np.float64]:
     return np.asarray((1 + np.square(noise / (_TOLERATED_NOISE * residual.spacing_px))) ** -2)
 
 
-def is_decreased_beyond_chance(before: Residual, after: Residual) -> bool:
-    """Return True if held-out shifts decrease by more than by chance, in the windows that both residuals have measured.
+def decrease_in_standard_errors(before: Residual, after: Residual) -> float:
+    """Return the mean decrease of held-out shifts relative to its standard error, in the windows that both residuals
+    have measured; 0 with fewer than two.
 
-    It is the mean decrease of log(1 + (length / 0.3 px)^2), which is robust to wrong peaks; their windows are of one
-    grid. The p95 alone is that of wrong peaks where images are noisy.
+    It is that of log(1 + (length / 0.3 px)^2), which is robust to wrong peaks. The windows are of one grid.
     """
-    # Standard errors: at most 3.0 with reliefs of flat scenes with noise, and 3.9 with fields of blurred ones; at least
-    # 5.4 with boxes, booms, trees and leaves, and 5.9 with the lens shapes of a dual camera.
-    min_sigma, scale_px = 4.0, 0.3
+    scale_px = 0.3
     before_px, after_px = _lengths_in_common_px(before, after)
-    if len(before_px) < 2:
-        return False
     losses = [np.log1p((px / scale_px) ** 2) for px in (before_px, after_px)]
-    return mean_in_standard_errors(losses[0] - losses[1]) >= min_sigma
+    return mean_in_standard_errors(losses[0] - losses[1]) if len(before_px) > 1 else 0.0
 
 
 def _lengths_in_common_px(one: Residual, other: Residual) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -129,6 +129,15 @@ def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
     assert estimated_factors(capture(0.0, seconds=1.0), known, "altitude_m") is None
 
 
+def test_a_capture_far_from_all_learned_ones_is_not_interpolated() -> None:
+    """The leave-one-out error of neighbours 10 s away says nothing of a capture hours later."""
+    slow = rig(*(capture(float(k // 3), seconds=10.0 * k) for k in range(9)))
+    near, far = (predict_band(slow, "Red", Observation(s, {}, {})) for s in (35.0, 36000.0))
+    assert near.source == "neighbours"
+    assert far.source == "flight"
+    assert far.std_px == predict_band(slow, "Red", Observation(None, {}, {})).std_px > 2 * near.std_px
+
+
 def test_with_few_captures_only_two_estimators_are_used() -> None:
     """Heights would predict these captures exactly; with five captures that may be chance."""
     captures = [capture(float(k % 3), seconds=float(k * 7 % 6), altitude_m=50.0 + k % 3) for k in range(6)]
