@@ -352,6 +352,13 @@ def test_the_rig_replaces_what_contradicts_it_and_what_is_less_certain(
         assert result.issues[0].value == result.prediction.off_px == pytest.approx(25.2)
 
 
+def test_a_certain_prediction_by_windows_stays_within_the_error_of_an_uncertain_rig() -> None:
+    """Whether it contradicts the rig depends on the standard error of the rig, as for aligned results."""
+    far = geometry.compose(AT_RIG, geometry.translation(9.0, 0.0))
+    for std_px, source in ((5.0, "windows"), (0.3, "bands")):
+        assert against(rig_prediction(far, std_px=std_px), in_part(0.01)).prediction.source == source
+
+
 def test_the_relief_of_a_scene_is_part_of_the_error_and_not_of_the_comparison() -> None:
     """A plane that is compared with the rig is not displaced by the relief that it does not follow."""
     certain = rig_prediction(geometry.translation(10, -4), std_px=0.1)
