@@ -44,7 +44,8 @@ _MAX_P95_GROWTH = 1.05
 """Maximum ratio of the p95 of held-out windows with a field to that without it, as the p95 is noisy."""
 _MIN_DECREASE = 2.0
 """Minimum decrease of the shifts of held-out windows by a field, in standard errors. A field that follows noise
-increases them: at most 0.9 in flat or already corrected bands, at least 2.2 with lens shapes and leaves."""
+increases them: at most 0.9 in bands that are flat or corrected already. Lens shapes and leaves in sharp images have at
+least 2.2."""
 _FOLDS = 4
 """Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
 
