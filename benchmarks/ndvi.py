@@ -5,8 +5,9 @@
 Without DATA: the synthetic flight, whose truth is the reflectance that it was painted with. With DATA, methods are
 compared on the four captures of the row crop below it (benchmarks/bands/README.md). There the truth is the NDVI of the
 same files when red and near infrared are resampled by a mapping that is fitted to the tie points, a cubic polynomial.
-Edges are the 10 % of the pixels where this NDVI changes most; only pixels between tie points count. OpenDroneMap is
-repeated: the median of its runs, and their range.
+Edges are the 10 % of the pixels where this NDVI changes most; only pixels between tie points count. Rows named "NIR
+shifted" have that mapping with near infrared shifted. OpenDroneMap is repeated: the median of its runs, and their
+range.
 """
 
 from collections.abc import Iterator, Mapping
@@ -43,6 +44,8 @@ SIZE_PX = (1280, 960)
 NDVI, BANDS = INDICES["ndvi"], ("NIR", "Red")
 REAL = "rededge_m_rowcrop"
 METHODS = "agalign, capture", *REPEATED
+SHIFTS_PX = {"along x": (1.0, 0.0), "along y": (0.0, 1.0), "diagonally": (0.5**0.5, 0.5**0.5)}
+"""Shifts of near infrared, px of its file."""
 OFF = 0.1
 """A pixel whose NDVI is off by more is counted."""
 EDGES = 0.1
@@ -137,6 +140,10 @@ def real_rows(data: Path) -> Iterator[TableRow]:
 
     count = f"{len(captures)} captures"
     yield TableRow("NDVI", "not aligned", count, cells([{"homography": np.eye(3).tolist()}] * len(pairs)))
+    nir = {files[capture, BANDS[0]] for capture in captures}
+    for name, shift_px in SHIFTS_PX.items():
+        rows = [shifted(row, shift_px) if pair.file in nir else row for pair, row in zip(pairs, true, strict=True)]
+        yield TableRow("NDVI", f"NIR shifted by 1 px {name}", count, cells(rows))
     for method in METHODS:
         runs = RUNS if method in REPEATED else 1
         of_runs = [cells(mapped(method, description, pairs, AS_IT_IS, paths, bands)) for _ in range(runs)]
@@ -148,6 +155,11 @@ def grid_of_ties(pair: Pair) -> dict[str, Any]:
     coefficients, *_ = np.linalg.lstsq(cubic(pair.reference_px), pair.moving_px)
     here = geometry.lattice(*SIZE_PX, SIZE_PX[0] // _GRID_PX, SIZE_PX[1] // _GRID_PX)
     return {"reference_px": here, "moving_px": cubic(here) @ coefficients}
+
+
+def shifted(row: Mapping[str, Any], shift_px: tuple[float, float]) -> dict[str, Any]:
+    """Return the lattice of a mapping with (x, y) added in the band."""
+    return {"grid": {**row["grid"], "moving_px": row["grid"]["moving_px"] + np.array(shift_px)}}
 
 
 def cubic(points_px: Points) -> NDArray[np.float64]:
