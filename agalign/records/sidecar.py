@@ -215,7 +215,7 @@ class ErrorPart(_Part):
     """
 
     std_px: Number4
-    """Standard error: RMS of the expected error over the area that both images show, without the shifts of `moved`."""
+    """Expected error of the band: its RMS over the area that both images show, without the shifts of `moved`."""
     std_band_px: Number4 | None = None
     """The same in px of the band."""
     covariance_px2: Annotated[NDArray[np.float64], Array((None, None), COVARIANCE_DECIMALS)] | None = None
@@ -581,7 +581,7 @@ class Sidecar(_Part):
     parallax: FilePart | None = None
     """Parallax raster on the pixels of the reference."""
     accept_predicted_px: Number
-    """Largest standard error of a predicted band for indices, px of the band."""
+    """Largest expected error of a predicted band for indices, px of the band."""
     estimated_with: str
     """Fingerprint of everything that the estimation depends on, apart from the contents of the files."""
     model: str = ""
