@@ -40,6 +40,7 @@ from agalign.records.excluded import last_excluded
 from agalign.records.listed_files import states_of
 from agalign.records.run_record import Finished, RunPart, RunState, begun, input_name, last_record
 from agalign.records.sidecar import FilePart
+from agalign.report.facts import PairTotals
 from agalign.report.pages import outdate_pages, pages_exist, write_pages
 from agalign.report.panels_and_sky import panel_picture, write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
@@ -74,6 +75,8 @@ class Listener:
     """How many finished captures are estimated or rendered again, and why; called before any is replaced."""
     on_problem: Callable[[str], object] = quiet
     """Why a file is not in the pages, which are written at the end of the run."""
+    on_pages: Callable[[PairTotals], object] = quiet
+    """The band pairs in the pages; not called if the pages of an earlier run are kept."""
     on_lost: Callable[[str], object] = quiet
     """Label of a capture whose files were removed after it was reported; called at the end of the run."""
 
@@ -362,7 +365,7 @@ class _FlightRun:
         record.end(self.out, state, seconds, earlier)
         try:
             if not pages_exist(self.out):
-                write_pages(self.out, self.listener.on_problem)
+                self.listener.on_pages(write_pages(self.out, self.listener.on_problem).pairs)
         except MemoryError:
             text = f"{self.out}: the report does not fit into memory; 'agalign report {self.out}' writes it elsewhere"
             logging.getLogger(__name__).warning(text)

@@ -8,7 +8,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -18,16 +18,15 @@ from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, explain
 from agalign.config import DiscoverOptions, RunOptions, Settings
-from agalign.errors import InputError, OutputError, SidecarError, WorkerError
+from agalign.errors import InputError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.host.files import REPORT_FILE
 from agalign.host.text import counted, escape_controls
-from agalign.records.cautions import RunFacts
 from agalign.records.excluded import exclusions, last_excluded
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar import BandResult
-from agalign.records.sidecar_file import read_sidecar
 from agalign.report.facts import PairTotals
+from agalign.report.pages import pair_totals
 from agalign.report.summary_csv import rounded
 from agalign.values.capture import Capture
 
@@ -110,10 +109,10 @@ class RunTotals:
     """Labels of the captures that are not aligned, as they show a panel or the sky."""
     states: Counter[str] = field(default_factory=Counter)
     """Number of captures by state."""
-    written: dict[str, tuple[str, Path]] = field(default_factory=dict)
-    """State and sidecar of each capture with a result, by label."""
+    written: dict[str, str] = field(default_factory=dict)
+    """State of each capture with a result, by label."""
     pairs: PairTotals = field(default_factory=PairTotals)
-    """The pairs of captures with a result, after `count`."""
+    """All band pairs below the output folder, as the report counts them; known at the end of the run."""
     removed: dict[str, list[Path]] = field(default_factory=lambda: defaultdict(list))
     """Files of earlier commands that were removed, by reason."""
     panel_ages_s: dict[str, list[float | None]] = field(default_factory=lambda: defaultdict(list))
@@ -127,24 +126,17 @@ class RunTotals:
             self.removed[reason].append(path)
         if report.state in ("panel", "sky"):
             self.excluded.add(report.label)
-        if report.result is None or report.path is None:
+        if report.result is None:
             return
-        self.written[report.label] = report.state, report.path
+        self.written[report.label] = report.state
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
 
     def lose(self, label: str) -> None:
         """Count a capture whose files were removed during the run as an error."""
-        if (written := self.written.pop(label, None)) is not None:
-            self.states = +(self.states + Counter(error=1) - Counter([written[0]]))
-
-    def count(self, out: Path) -> None:
-        """Count the pairs in the sidecars of the run, in the order of the report."""
-        self.pairs = PairTotals(RunFacts.of(out))
-        for label, (_, path) in sorted(self.written.items(), key=lambda one: one[1][1]):
-            with suppress(SidecarError):  # the report names it
-                self.pairs.add(label, read_sidecar(path))
+        if (state := self.written.pop(label, None)) is not None:
+            self.states = +(self.states + Counter(error=1) - Counter([state]))
 
 
 def run(
@@ -165,6 +157,7 @@ def run(
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
     totals, problems, started = RunTotals(flight.is_complete, asked), list[str](), time.monotonic()
+    counted_pairs: list[PairTotals] = []
     with cluster(dask, options.jobs) as executor, progress(terminal, len(flight.captures)) as show_line:
         options = replace(options, executor=executor)
 
@@ -172,7 +165,9 @@ def run(
             skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
             show_line(totals.states.total() + share, text, skipped)
 
-        listener = replace(_listener(terminal, show), on_problem=problems.append, on_lost=totals.lose)
+        listener = replace(
+            _listener(terminal, show), on_problem=problems.append, on_pages=counted_pairs.append, on_lost=totals.lose
+        )
         try:
             with closing(run_flight(flight, out, settings, options, listener, model)) as reports:
                 for report in reports:
@@ -187,7 +182,7 @@ def run(
     for problem in problems:
         terminal.problem(problem)
     totals.is_complete &= not problems
-    totals.count(out)
+    totals.pairs = counted_pairs[0] if counted_pairs else pair_totals(out)
     seconds = round(time.monotonic() - started, 1)
     terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)
     return totals
@@ -326,24 +321,30 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         or_sky = " or the sky" if totals.states["sky"] else ""
         terminal.problem(f"all captures show calibration panels{or_sky}; --align-panels aligns them like any other")
         return ExitCode.NOTHING
+    if not totals.written:
+        terminal.problem("no capture could be processed")
+        return ExitCode.NOTHING
     statuses = totals.pairs.statuses
     if not statuses["aligned"] + statuses["predicted"]:
-        terminal.problem("no band pair could be aligned" if statuses else "no capture could be processed")
-        return ExitCode.PARTIAL if statuses else ExitCode.NOTHING
-    is_usable = not any(group.is_unusable for group in totals.pairs.groups())
+        terminal.problem("no band pair could be aligned")
+        return ExitCode.PARTIAL
+    of_run = set(map(escape_controls, totals.written))  # the report may count results of other runs too
+    is_usable = not any(b.is_unusable and b.capture in of_run for group in totals.pairs.groups() for b in group.bands)
     return ExitCode.OK if totals.is_complete and is_usable else ExitCode.PARTIAL
 
 
 def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
-    statuses, written = totals.pairs.statuses, totals.pairs.captures
-    unfinished = [pairs for label, pairs in totals.asked.items() if label not in written | totals.excluded]
-    asked, lost = statuses.total() + sum(unfinished), len(unfinished)
+    statuses, finished = totals.pairs.statuses, totals.written.keys() | totals.excluded
+    unfinished = [label for label in totals.asked if label not in finished]
+    # One may have a result of an earlier run.
+    uncounted = [label for label in unfinished if escape_controls(label) not in totals.pairs.captures]
+    asked, lost = statuses.total() + sum(totals.asked[label] for label in uncounted), len(unfinished)
     if statuses:
         missing = f"; {counted(lost, 'capture')} not written" if lost else ""
         _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
     explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(lost + len(written), 'capture')}"
+        of_all = f"{lost} of {counted(lost + len(totals.written), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; mend them, and repeat the command")
     for quantity, ages_s in totals.panel_ages_s.items():
         age_s = max((one for one in ages_s if one is not None), default=None)

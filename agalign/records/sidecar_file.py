@@ -91,13 +91,20 @@ def read_with_change(path: Path) -> tuple[Sidecar, Reason | None]:
     """
     text = _contents(path)
     sidecar = _parsed(path, text)
-    if Path(sidecar.capture).name != path.stem:
-        return sidecar, Reason(f"belongs to {shortened(sidecar.capture)}", "delete it and run again")
+    if place := place_problem(path, sidecar):
+        return sidecar, place
     if sidecar.checksum is None:
         return sidecar, Reason("has no checksum, so that changes cannot be found", "run again")
     if sidecar.checksum != content_checksum(text):
         return sidecar, Reason("was changed after it was written", "run again")
     return sidecar, None
+
+
+def place_problem(path: Path, sidecar: Sidecar) -> Reason | None:
+    """Return that the sidecar at a path is that of another capture; None if it is not."""
+    if sidecar.capture == path.stem:
+        return None
+    return Reason(f"belongs to {shortened(sidecar.capture)}", "delete it and run again")
 
 
 def _contents(path: Path) -> bytes:

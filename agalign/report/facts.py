@@ -58,11 +58,6 @@ class CautionGroup:
         """Number of captures with such a band."""
         return len({b.capture for b in self.bands})
 
-    @property
-    def is_unusable(self) -> bool:
-        """True if the values of a band are too uncertain for any use."""
-        return any(b.is_unusable for b in self.bands)
-
 
 @dataclass
 class BandTotals:

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 from collections import defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
@@ -19,13 +19,15 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
+from agalign.host.text import escape_controls
+from agalign.records.cautions import RunFacts
 from agalign.records.excluded import PanelPart, SkyPart, exclusions, read_excluded
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import find_sidecars, label_of, read_with_change
+from agalign.records.sidecar_file import find_sidecars, label_of, place_problem, read_sidecar
 from agalign.report.charts import drifts_of, rig_views
-from agalign.report.facts import FlightFacts
+from agalign.report.facts import FlightFacts, PairTotals
 from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
 from agalign.report.terms import PAGES, TERMS
@@ -96,17 +98,8 @@ def _add_captures(
         rows_of[row.capture].append(row)
     indices: list[IndexReport] = []
     changed: set[Path] = set()
-    for path, states in counted_sidecars(find_sidecars(out), out).items():
+    for path, sidecar, states in _results(out, on_problem):
         folder = path.parent.relative_to(out).as_posix()
-        try:
-            sidecar, change = read_with_change(path)
-        except SidecarError as error:
-            on_problem(str(error))
-            continue
-        label = label_of(path, out)
-        if label != Path(folder, sidecar.capture).as_posix():
-            on_problem(f"{path}: {change}")
-            continue
         listed = ListedFiles.of(sidecar, path.parent, states)
         # The report needs no stacks: these may be deleted.
         problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}
@@ -116,10 +109,34 @@ def _add_captures(
         sidecar = _without(sidecar, path.parent, problems)
         of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
         indices += of_capture
-        rows = [row for row in rows_of.get(label, []) if row.path not in changed]
+        rows = [row for row in rows_of.get(label_of(path, out), []) if row.path not in changed]
         facts.add(folder, sidecar, merged(rows, of_capture))
         flight_map.add(folder, sidecar)
     return update_table(out, indices, [row for row in earlier if row.path not in changed])
+
+
+def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[tuple[Path, Sidecar, str]]:
+    """Yield the results that the pages show: path and content of each sidecar, and the states of its files in the run
+    record. Those that cannot be read, or are at the place of another capture, are reported to `on_problem`.
+    """
+    for path, states in counted_sidecars(find_sidecars(out), out).items():
+        try:
+            sidecar = read_sidecar(path)
+        except SidecarError as error:
+            on_problem(str(error))
+            continue
+        if problem := place_problem(path, sidecar):
+            on_problem(f"{path}: {problem}")
+        else:
+            yield path, sidecar, states
+
+
+def pair_totals(out: Path) -> PairTotals:
+    """Return the band pairs in the pages of an output folder, without writing these."""
+    pairs = PairTotals(RunFacts.of(out))
+    for path, sidecar, _ in _results(out, lambda _: None):
+        pairs.add(escape_controls(label_of(path, out)), sidecar)
+    return pairs
 
 
 def _without(sidecar: Sidecar, folder: Path, changed: Collection[Path]) -> Sidecar:

@@ -26,10 +26,14 @@ from agalign.cli.command import Command, help_of
 from agalign.cli.terminal import Terminal, exits
 from agalign.config import RunOptions
 from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
+from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import write_sidecar
+from agalign.report.facts import PairTotals
+from agalign.report.pages import pair_totals
 
 from ..conftest import raising, seeded, write_capture
 from ..program import agalign_here
+from ..records.test_cautions import panel
 from ..records.test_sidecar import NIR, example
 
 GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
@@ -311,8 +315,7 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     few_saturated = NIR | {"reason": None, "saturated": 0.001}
     sidecar = example(output=output | {"panel_age_s": age_s}, bands=[few_saturated])
     totals.add(CaptureReport("IMG_1", "done", sidecar, tmp_path / "IMG_1.json"))
-    write_sidecar(tmp_path / "IMG_1.json", sidecar)
-    totals.count(tmp_path)
+    totals.pairs.add("IMG_1", sidecar)
     conclude(totals, tmp_path, Terminal())
     printed = capsys.readouterr()
     assert f"Written as {radiometry}: {text}" in printed.out.splitlines()
@@ -330,12 +333,12 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(
     blue = {"band": "Blue", "file": "b.tif", "band_index": 1, "width": 10, "height": 8}
     aligned = NIR | {"status": "aligned", "reason": None}
     complete = example(capture="IMG_0", bands=[aligned | {"saturated": 0.031}, aligned | {"band": "Red"}])
-    other = example(bands=[aligned], missing_bands=["Green"], reference=blue)
-    for name, sidecar in (("IMG_1", other), ("IMG_0", complete)):  # in the order in which they finish
-        path = tmp_path / f"{name}.json"
-        totals.add(CaptureReport(name, "done", write_sidecar(path, sidecar), path))
+    other = example(capture="IMG_1", bands=[aligned], missing_bands=["Green"], reference=blue)
+    for sidecar in (other, complete):  # in the order in which they finish
+        path = tmp_path / f"{sidecar.capture}.json"
+        totals.add(CaptureReport(sidecar.capture, "done", write_sidecar(path, sidecar), path))
     totals.add(CaptureReport("IMG_2", "panel", panel="a calibration panel"))
-    totals.count(tmp_path)
+    totals.pairs = pair_totals(tmp_path)
     assert [label for label, *_ in totals.pairs._references] == ["IMG_0", "IMG_1"], "that of the report"
     assert conclude(totals, tmp_path, Terminal()) == 3
     printed = capsys.readouterr()
@@ -345,6 +348,17 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(
     assert reference in printed.err
     assert "1 of 3 captures could not be written" in printed.err
     assert "IMG_0 NIR: check: 3.1% of the pixels are saturated" in printed.err
+
+
+@pytest.mark.parametrize(("of_run", "code"), [("IMG_1", 0), ("IMG_2", 3)])
+def test_the_exit_code_is_that_of_the_captures_of_the_run(of_run: str, code: int, tmp_path: Path) -> None:
+    """The other one is a result of an earlier run, which is listed."""
+    totals = RunTotals(True, {of_run: 1}, written={of_run: "done"}, pairs=PairTotals(RunFacts((panel(NIR=15.46),))))
+    aligned = NIR | {"status": "aligned", "reason": None}
+    totals.pairs.add("IMG_1", example(bands=[aligned]))
+    by_sensor = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": "reflectance by light sensor"}
+    totals.pairs.add("IMG_2", example(bands=[aligned], output=by_sensor))
+    assert conclude(totals, tmp_path, Terminal()) == code
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX")

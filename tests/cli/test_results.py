@@ -9,13 +9,16 @@ import rasterio
 
 import agalign
 from agalign.batch import capture_task
+from agalign.cli import align_run
+from agalign.cli.align_run import conclude
+from agalign.cli.terminal import Terminal
 from agalign.records.captures import captures_of_run
 from agalign.records.excluded import read_excluded
 from agalign.records.run_record import read_run_record, unfinished_run
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, write_sidecar
 
 from ..builders import in_full_run
-from ..conftest import Shared, raising, seeded, write_band, write_capture
+from ..conftest import Shared, raising, read_json, seeded, write_band, write_capture
 from ..program import agalign_here
 from ..run_outputs import change, table_in
 
@@ -185,6 +188,29 @@ def test_a_season_may_be_aligned_folder_by_folder(flight: Path, tmp_path: Path) 
     assert (record.labels, record.other_inputs) == (["IMG_0002"], {str(days[0].resolve()): ["IMG_0001"]})
     assert record.notes_on_input() == []
     assert captures_in(out / "summary.csv") == {"IMG_0001", "IMG_0002"}
+
+
+def test_table_and_report_count_the_same_results_once(
+    flight: Path, out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The results of other runs are among them. Each sidecar is read once for both."""
+    (first,) = out.rglob("IMG_0001.json")
+    failed = {"status": "failed", "reason": "blank"}
+    bands = [band | (failed if band["status"] == "aligned" else {}) for band in read_json(first)["bands"]]
+    change(first, bands=bands)
+    second, table = agalign.DiscoverOptions(include=("IMG_0002*",)), "4 of 8 band pairs"
+
+    def run() -> int:
+        scan, settings = agalign.discover(flight, second), seeded("rig", layout="both")
+        return conclude(align_run.run(scan, out, settings, Terminal(), agalign.RunOptions()), out, Terminal())
+
+    with monkeypatch.context() as patch:
+        patch.setattr(align_run, "pair_totals", raising(AssertionError("the sidecars are read again")))
+        assert run() == 0
+    assert f"{table} aligned" in capsys.readouterr().out
+    assert f"{table} are aligned" in (out / "index.html").read_text()
+    assert run() == 0, "the report is kept"
+    assert f"{table} aligned" in capsys.readouterr().out
 
 
 def test_after_a_failed_rendering_the_results_are_not_called_good(
