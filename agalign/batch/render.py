@@ -25,7 +25,7 @@ from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.aligned_files import BandFiles, Stack
 from agalign.rasters.alignment_maps import ReliefMap, moved_share, share_over_1_px
 from agalign.rasters.output_grid import output_layers
-from agalign.rasters.product import CapturePaths, ProductContext, RenderOptions
+from agalign.rasters.product import CapturePaths, LostFile, ProductContext, RenderOptions, WrittenFile
 from agalign.records.sidecar import (
     BandRadiometryPart,
     BandResult,
@@ -82,17 +82,18 @@ def render(
     if sidecar.rendered_with:  # a run that is killed now must render again
         sidecar = write_sidecar(paths.sidecar, sidecar.model_copy(update={"rendered_with": ""}))
     whole = OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(capture, paths, settings, sidecar, alignments, (), whole, options, read=read)
+    written: list[WrittenFile] = []
+    context = ProductContext(capture, paths, settings, sidecar, alignments, (), whole, options, written, read)
     if context.with_pixels:
         layers, grid = output_layers(capture, context.with_pixels, write, options.common, read)
         ties = tie_windows(capture, settings.seed, alignments, read) if write.tie_points else {}
         context = replace(context, layers=layers, grid=grid, ties=ties)
-    failures = _write_products(context)
-    written = {file.path for file in context.written}
-    removed = [(path, reason) for path, reason in outdated.items() if path not in written]
+    failures, lost = _write_products(context, written)
+    here = {file.path for file in written}
+    removed = [(path, reason) for path, reason in outdated.items() if path not in here]
     remove_files([path for path, _ in removed], out)
-    reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
-    gone = [part for part in gone if paths.folder / part.file not in written]
+    reasons = tuple((path, lost.get(path, reason)) for path, reason in removed if reason)
+    gone = [part for part in gone if paths.folder / part.file not in here]
     result = rendered_sidecar(context, list(failures), time.perf_counter() - began_s, gone)
     written_sidecar = write_sidecar(paths.sidecar, result).without_tables()
     failed = tuple(dict.fromkeys(failures.values()))  # products that need the same file fail with the same message
@@ -109,21 +110,27 @@ def _gone_indices(sidecar: Sidecar, paths: CapturePaths) -> list[FilePart]:
     return [part for part in parts if part.file.removesuffix(".tif").removesuffix(".png") in gone]
 
 
-def _write_products(context: ProductContext) -> dict[str, str]:
-    """Write the enabled products; return {kind: message} of optional ones that failed. Raises like `Product.write`."""
-    failures: dict[str, str] = {}
+def _write_products(context: ProductContext, written: list[WrittenFile]) -> tuple[dict[str, str], dict[Path, str]]:
+    """Write the enabled products, and add their files to `written`, which the context has. Return the messages of
+    optional ones that failed, by kind, and why files of an earlier command are lost, by path.
+
+    Raises like `Product.write`.
+    """
+    failures, lost = dict[str, str](), dict[Path, str]()
     for product in PRODUCTS:
         if not product.is_enabled(context.settings.write) or (product.needs_layers and not context.layers):
             continue
         try:
             for file in product.write(context):
-                # At once: the sidecar also lists the files before an error, so that they are removed later.
-                context.written.append(file)
+                if isinstance(file, LostFile):
+                    lost[file.path] = file.reason
+                else:  # at once: the sidecar also lists the files before an error, so that they are removed later
+                    written.append(file)
         except AgalignError as error:
             if product.is_required:
                 raise
             failures[product.kind] = str(error)
-    return failures
+    return failures, lost
 
 
 # ---- the part of the sidecar that describes the rendered files

@@ -29,7 +29,7 @@ from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.gdal import open_local
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, suffix_format, with_nan
-from agalign.rasters.drawing import MAX_REDUCED_PX, grey
+from agalign.rasters.drawing import MAX_REDUCED_PX, Grey, grey
 from agalign.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
@@ -165,15 +165,16 @@ def _written(
     kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags
 ) -> WrittenFile:
     """Write layers as the bands of one file, and return it."""
-    nodata = write_raster(context, layers, path, tags)
+    nodata, grey_of = write_raster(context, layers, path, tags)
     bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
-    return WrittenFile(kind, path, bands, nodata, is_flat=is_flat)
+    return WrittenFile(kind, path, bands, nodata, is_flat=is_flat, grey=grey_of)
 
 
 def write_raster(
     context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags | None = None
-) -> float | None:
-    """Write layers of a capture as the bands of one file atomically; return its nodata value.
+) -> tuple[float | None, Mapping[str, Grey]]:
+    """Write layers of a capture as the bands of one file atomically; return its nodata value, and the bands as grey
+    images by name where these need no reduction.
 
     The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
     radiometric calibration. A nodata value is declared only if some pixel needs it; valid moving pixels that equal it
@@ -201,12 +202,13 @@ def write_raster(
         if settings.format == "cog":
             to_cog(partial, compression)
 
-    blocks, georeference = _blocks(context, layers, dtype, nodata), capture.reference.georeference
+    grey_of: dict[str, Grey] = {}
+    blocks, georeference = _blocks(context, layers, dtype, nodata, grey_of), capture.reference.georeference
     descriptions, own_tags, grid = _descriptions(context, layers), _tags(capture, layers, raw=raw), context.grid
     write_on_grid(
         path, grid, georeference, descriptions, blocks, tags=own_tags, dtype=dtype.name, options=options, finish=finish
     )
-    return nodata
+    return nodata, grey_of
 
 
 def is_aligned_raster(path: Path) -> bool:
@@ -274,8 +276,13 @@ def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
 
 
 def _blocks(
-    context: ProductContext, layers: Sequence[Layer], dtype: np.dtype[Any], nodata: float | None
+    context: ProductContext,
+    layers: Sequence[Layer],
+    dtype: np.dtype[Any],
+    nodata: float | None,
+    grey_of: dict[str, Grey],
 ) -> Iterator[Block]:
+    """Yield the pixels of layers, and add their grey images to `grey_of`."""
     grid = context.grid
     for index, layer in enumerate(layers, start=1):
         for tile in tiles(grid.tile, WORK_TILE_PX):
@@ -287,7 +294,7 @@ def _blocks(
                 if nodata is not None and not (valid.all() and layer.is_copied):
                     pixels = with_nodata(pixels, valid, nodata)
                 if pixels.shape == (grid.height, grid.width) and max(pixels.shape) <= MAX_REDUCED_PX:
-                    context.written_grey[layer.band.name] = grey(with_nan(pixels, nodata))
+                    grey_of[layer.band.name] = grey(with_nan(pixels, nodata))
             yield pixels, index, tile.x0 - grid.x0, tile.y0 - grid.y0
 
 

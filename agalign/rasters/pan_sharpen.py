@@ -62,9 +62,7 @@ class PanSharpened(Product):
         settings = context.settings.write.model_copy(update=fine)
         common = common_grid(capture.reference, settings, context.options.limits)
         layers, grid = output_layers(capture, usable, settings, common, context.read)
-        context = replace(
-            context, settings=context.settings.model_copy(update={"write": settings}), grid=grid, written_grey={}
-        )
+        context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
         pan = [la for la in layers if la.band in broad]
         others = [
             la

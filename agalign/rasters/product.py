@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from agalign.config import Settings, WriteSettings
 from agalign.host.files import file_checksum
@@ -62,6 +62,8 @@ class WrittenFile:
     """Layout of the preview; None for other files."""
     is_flat: bool = False
     """The vignetting of raw numbers is corrected in the pixels."""
+    grey: Mapping[str, Grey] = field(default_factory=dict)
+    """Its bands as grey images where these need no reduction, so that the file is not decoded for them."""
     index_before: tuple[str, Grey] | None = None
     """Of an index raster, the name of the index and its values in the unaligned bands, if these have the pixels of the
     grid, as `ReducedBands.indices_before`."""
@@ -75,6 +77,13 @@ class WrittenFile:
     def sha256(self) -> str:
         """Checksum of the file. Raises OutputError."""
         return file_checksum(self.path)
+
+
+class LostFile(NamedTuple):
+    """A file of an earlier command that cannot be written again."""
+
+    path: Path
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -105,16 +114,12 @@ class ProductContext:
     grid: OutputGrid
     """Grid of all rasters; that of the reference's file if there are no layers."""
     options: RenderOptions = RenderOptions()
-    written: list[WrittenFile] = field(default_factory=list)
-    """Files of the products before this one in `PRODUCTS`."""
+    written: Sequence[WrittenFile] = ()
+    """Files of the products before this one in `PRODUCTS`, to which the rendering adds those of each product."""
     read: ReadTile = read_tile
     """Reads the pixels of the files of the capture."""
     ties: Mapping[str, Residual] = field(default_factory=dict)
     """Windows by moving band, measured under the mapping; empty unless tie points are written."""
-    written_grey: dict[str, Grey] = field(default_factory=dict)
-    """Written bands as grey images where these need no reduction, so that the files are not decoded for them."""
-    lost: dict[Path, str] = field(default_factory=dict)
-    """Files of an earlier command that cannot be rendered again, and why."""
 
     @property
     def is_raw(self) -> bool:
@@ -148,7 +153,8 @@ class ProductContext:
     def reduced_bands(self) -> ReducedBands:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         places = {name: (file.path, index) for name, (file, index) in self.places.items()}
-        bands = read_reduced_bands(self.capture, places, self.grid, self.read, self.written_grey)
+        known = {name: grey for file in self.written for name, grey in file.grey.items()}
+        bands = read_reduced_bands(self.capture, places, self.grid, self.read, known)
         return replace(bands, indices_before=dict(file.index_before for file in self.written if file.index_before))
 
 
@@ -188,8 +194,9 @@ class Product(ABC):
         return [paths.file(self.suffix)]
 
     @abstractmethod
-    def write(self, context: ProductContext) -> Iterable[WrittenFile]:
-        """Write the files, each atomically, and return them; none if the capture lacks the input for them.
+    def write(self, context: ProductContext) -> Iterable[WrittenFile | LostFile]:
+        """Write the files, each atomically, and return them, with those that are lost; none if the capture lacks the
+        input for them.
 
         Raises OutputError, or UnreadableFileError for an input.
         """

@@ -27,7 +27,7 @@ from agalign.rasters import geotiff
 from agalign.rasters.aligned_files import tags_of
 from agalign.rasters.band_reader import RAW, BandReader
 from agalign.rasters.drawing import with_text, write_png
-from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
+from agalign.rasters.product import CapturePaths, LostFile, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand, bands_of
 from agalign.records.listed_files import ListedFiles
 from agalign.records.sidecar import Sidecar
@@ -164,7 +164,7 @@ class IndexRasters(Product):
         """Return True: rasters that an earlier command wrote are written again."""
         return True
 
-    def write(self, context: ProductContext) -> Iterator[WrittenFile]:
+    def write(self, context: ProductContext) -> Iterator[WrittenFile | LostFile]:
         """Write the indices that were requested and of which the capture has all bands, usable, and those that an
         earlier command wrote.
 
@@ -184,11 +184,11 @@ class IndexRasters(Product):
         masked = list(_masked(bands, context))
         for raster in earlier:
             if raster.index is None:
-                context.lost[raster.path] = "its formula is unknown"
+                yield LostFile(raster.path, "its formula is unknown")
                 continue
             (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
             if report.problem:
-                context.lost[raster.path] = report.problem
+                yield LostFile(raster.path, report.problem)
             else:
                 yield from self._files(context, raster.index, report)
         if problems:
