@@ -40,8 +40,8 @@ from agalign.records.excluded import last_excluded
 from agalign.records.listed_files import states_of
 from agalign.records.run_record import Finished, RunPart, RunState, begun, input_name, last_record
 from agalign.records.sidecar import FilePart
-from agalign.report.facts import PairTotals
 from agalign.report.pages import outdate_pages, pages_exist, write_pages
+from agalign.report.pair_totals import PairTotals
 from agalign.report.panels_and_sky import panel_picture, write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture

@@ -25,8 +25,8 @@ from agalign.host.text import counted, escape_controls
 from agalign.records.excluded import exclusions, last_excluded
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar import BandResult
-from agalign.report.facts import PairTotals
 from agalign.report.pages import pair_totals
+from agalign.report.pair_totals import PairTotals
 from agalign.report.summary_csv import rounded
 from agalign.values.capture import Capture
 

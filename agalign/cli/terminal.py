@@ -24,7 +24,7 @@ from agalign.host.text import counted, escape_controls
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from agalign.report.facts import CautionGroup
+    from agalign.report.pair_totals import CautionGroup
 
 MAX_LISTED = 10
 """Maximum number of listed problems of one kind."""

@@ -1,5 +1,5 @@
 """What to check before the results of a run are used: one list for report, tables, console and log, largest effect
-first. Here are the cautions of one capture; `PairTotals` in `report.facts` collects those of a run.
+first. Here are the cautions of one capture; `PairTotals` in `report.pair_totals` collects those of a run.
 """
 
 import math

@@ -1,10 +1,10 @@
-"""The data that the report shows about each capture, and the bands that are not aligned, by cause, with its remedy."""
+"""The data that the report shows about each capture."""
 
 import json
-import math
+import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from statistics import median
@@ -13,136 +13,23 @@ from urllib.parse import quote
 
 import numpy as np
 
+from agalign.errors import ConfigurationError
 from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.host.text import escape_controls
-from agalign.records.cautions import MIN_SHARE_OVER_1_PX, Caution, RunFacts
+from agalign.records.cautions import MIN_SHARE_OVER_1_PX, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
-from agalign.report.light_over_captures import LightOverCaptures
 from agalign.report.page_data import DataParts
+from agalign.report.pair_totals import CautionGroup, PairTotals, usable_bands
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
-from agalign.report.verdict import Verdict, is_by_prediction, largest_error, unwritten_indices
-from agalign.spectral_indices.rasters import IndexReport
+from agalign.spectral_indices.formulas import index_named
+from agalign.spectral_indices.rasters import IndexReport, reason_not_written
 from agalign.values.alignment import Prediction
-from agalign.values.remedies import NO_RESULT, OTHER_REFERENCE, Remedy
+from agalign.values.remedies import NO_RESULT
 
+_NO_RASTER = "its raster does not exist; 'agalign indices' writes it"
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
-
-
-@dataclass(frozen=True)
-class CautionGroup:
-    """The bands of a run with the same status and the same cause for a check."""
-
-    status: str
-    remedy: Remedy
-    bands: Sequence[Caution]
-    effect: float
-    """Share of the values of all bands of the run that are missing, displaced or wrong, by `Caution.lost`."""
-
-    @property
-    def size(self) -> str:
-        """How large it is, in words; empty if it has no size."""
-        return max(self.bands, key=attrgetter("size")).size_text
-
-    @property
-    def advice(self) -> str:
-        """The remedy; for predicted bands, also when they may be used as they are."""
-        if self.status != "predicted":
-            return self.remedy.advice
-        usable = "indices use those with a standard error (prediction.std_px, px of the band) within --accept-predicted"
-        return f"{usable}; {self.remedy.advice}"
-
-    @property
-    def captures(self) -> int:
-        """Number of captures with such a band."""
-        return len({b.capture for b in self.bands})
-
-
-@dataclass
-class BandTotals:
-    """One band over all captures."""
-
-    statuses: Counter[str] = field(default_factory=Counter)
-    """Number of captures by the status of the band."""
-    residuals_px: list[float] = field(default_factory=list)
-    """Of the captures in which it is aligned."""
-    offsets_px: list[float] = field(default_factory=list)
-    """Lengths of its offset between the raw files; for the report only."""
-    seconds: list[float] = field(default_factory=list)
-    """Processing times."""
-
-
-@dataclass
-class PairTotals:
-    """The band pairs of a run, and what to check in them. Captures are added one by one, and not kept, which limits
-    memory.
-    """
-
-    run: RunFacts = field(default_factory=RunFacts)
-    bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
-    _cautions: list[Caution] = field(default_factory=list)
-    _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
-    """(capture, flight, reference band, its other bands with the missing ones)."""
-    _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    """By flight, the number of captures that have a band as the reference, or lack it."""
-    _light: LightOverCaptures = field(default_factory=LightOverCaptures)
-
-    def add(self, label: str, result: Sidecar) -> list[Caution]:
-        """Add the bands of a capture, and return the cautions about them."""
-        parts = {b.band: b for b in result.bands}
-        for name, status, _ in result.pairs:
-            band, part = self.bands[name], parts.get(name)
-            band.statuses[status] += 1
-            band.seconds += [] if part is None else [part.seconds]
-            if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
-                band.residuals_px.append(part.metrics.after.residual_px)
-        camera, reference = result.camera, result.reference.band
-        of_light = self._light.add(label, f"{camera.name} {camera.serial}", result.captured_at, result.output)
-        cautions = [replace(c, capture=label) for c in (*self.run.cautions(result, label), *of_light)]
-        self._cautions += cautions
-        flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
-        self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
-        self._votes[flight].update((reference, *result.missing_bands))
-        return cautions
-
-    @property
-    def statuses(self) -> Counter[str]:
-        """Number of pairs by status, with those of missing bands."""
-        return sum((band.statuses for band in self.bands.values()), Counter())
-
-    @property
-    def captures(self) -> set[str]:
-        """Labels of the captures."""
-        return {label for label, *_ in self._references}
-
-    def _other_references(self, lost: float) -> Iterator[Caution]:
-        """Yield the captures whose reference differs from that of most captures of their flight. All their values are
-        displaced from those of the others; `lost` is the number of bands of a capture.
-        """
-        for label, flight, band, others in self._references:
-            usual = self._votes[flight].most_common(1)[0][0]
-            if usual in others:
-                reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
-                yield Caution(band, OTHER_REFERENCE, reason, lost, status="other_reference", capture=label)
-
-    def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:
-        """Return what to check, by cause, the largest effect first: the cautions about bands, the captures with another
-        reference than most of their flight, and those without a result, given by label.
-        """
-        pairs = self.statuses.total()
-        pairs_per_capture = pairs / max(1, len(self._references))
-        pairs_without_result = max(1.0, pairs_per_capture)
-        by_cause: dict[tuple[str, Remedy], list[Caution]] = defaultdict(list)
-        for caution in (*self._cautions, *self._other_references(pairs_per_capture), *self._light.uneven()):
-            by_cause[caution.status, caution.remedy].append(caution)
-        for label in without_result:
-            lost = Caution("", NO_RESULT, NO_RESULT.cause, pairs_without_result, status="no_result", capture=label)
-            by_cause[lost.status, lost.remedy].append(lost)
-        values = max(1.0, pairs + pairs_without_result * len(without_result))
-        groups = [CautionGroup(*cause, bands, sum(b.lost for b in bands) / values) for cause, bands in by_cause.items()]
-        severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
-        return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
 
 
 _DETAILS_PER_PART = 50
@@ -171,7 +58,8 @@ class FlightFacts:
     def __init__(self, out: Path) -> None:
         self.out = out
         self.pairs = PairTotals(RunFacts.of(out))
-        self.verdict = Verdict()
+        self.unwritten: dict[str, list[tuple[str, str]]] = defaultdict(list)
+        """(label, reason) of the captures by requested index that was not written."""
         self.statuses: Counter[str] = Counter()
         """Number of captures by status as the page shows it: `ok_by_prediction` is not `ok`."""
         self.cameras: dict[str, CameraOffsets] = {}
@@ -199,7 +87,8 @@ class FlightFacts:
             checks[caution.band].append(caution.reason)
         keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
         unwritten = list(unwritten_indices(sidecar, self.out / folder, indices))
-        self.verdict.add(escape_controls(label), sidecar, unwritten)
+        for name, why in unwritten:
+            self.unwritten[name].append((escape_controls(label), why))
         facts = _of_capture(Path(folder), label, sidecar) | {
             "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
@@ -436,3 +325,38 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
     centre = (np.array(sidecar.reference.size_px) - 1) / 2
     dx, dy = offsets[np.linalg.norm(reference_px - centre, axis=1).argmin()].tolist()
     return (round(dx, 3), round(dy, 3)), round(median(np.linalg.norm(offsets, axis=1).tolist()), 3)
+
+
+def largest_error(sidecar: Sidecar) -> ErrorPart | None:
+    """Return the largest expected error of the moving bands of a capture that indices can use, by px of the reference;
+    None if none is known.
+    """
+    errors = (b.error for b in usable_bands(sidecar) if b.error is not None)
+    return max(errors, key=attrgetter("std_px"), default=None)
+
+
+def is_by_prediction(sidecar: Sidecar) -> bool:
+    """Return True for a capture that is `ok`, but with a predicted band, which its own image did not confirm."""
+    return sidecar.status == "ok" and any(b.status == "predicted" for b in sidecar.bands)
+
+
+def unwritten_indices(sidecar: Sidecar, folder: Path, reports: Sequence[IndexReport]) -> Iterator[tuple[str, str]]:
+    """Yield (name, reason) of the indices without a raster: those that the last rendering of the capture requested, and
+    those that `agalign indices` could not write, given the folder of the sidecar and the reports of the capture.
+    """
+    problems = {report.index: report.problem for report in reports if report.path is None}
+    written = {report.index for report in reports} - problems.keys()
+    requested = (sidecar.options or {}).get("write", {}).get("indices", [])
+    for name in dict.fromkeys([*map(str, requested), *problems]):
+        if name not in written:
+            before = f"when it was last calculated: {problems[name]}" if name in problems else _NO_RASTER
+            yield name, _reason(name, sidecar, folder) or before
+
+
+def _reason(name: str, sidecar: Sidecar, folder: Path) -> str:
+    """Why an index cannot be calculated now; empty if it can, or if its formula is not known."""
+    try:
+        # The page may be opened elsewhere: files are relative to their capture.
+        return reason_not_written(index_named(name), sidecar, folder).replace(f"{folder}{os.sep}", "")
+    except ConfigurationError:  # a formula, or an index of another version
+        return ""

@@ -27,9 +27,10 @@ from agalign.records.run_record import RunPart, counted_sidecars, read_run_recor
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import find_sidecars, label_of, place_problem, read_sidecar
 from agalign.report.charts import drifts_of, rig_views
-from agalign.report.facts import FlightFacts, PairTotals
+from agalign.report.facts import FlightFacts
 from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
+from agalign.report.pair_totals import PairTotals
 from agalign.report.terms import PAGES, TERMS
 from agalign.spectral_indices.indices_csv import current_rows, merged, reports_of, update_table
 from agalign.spectral_indices.rasters import IndexReport

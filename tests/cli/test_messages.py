@@ -28,8 +28,8 @@ from agalign.config import RunOptions
 from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
 from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import write_sidecar
-from agalign.report.facts import PairTotals
 from agalign.report.pages import pair_totals
+from agalign.report.pair_totals import PairTotals
 
 from ..conftest import raising, seeded, write_capture
 from ..program import agalign_here

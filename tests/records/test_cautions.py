@@ -18,8 +18,8 @@ from agalign.records.cautions import Caution, RunFacts
 from agalign.records.excluded import PanelPart
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
-from agalign.report.facts import PairTotals
 from agalign.report.pages import write_pages
+from agalign.report.pair_totals import PairTotals
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from agalign.records.cautions import Caution
-from agalign.report.facts import PairTotals
+from agalign.report.pair_totals import PairTotals
 from agalign.values.remedies import JUMP, NOT_FLAT
 
 from ..records.test_sidecar import example

@@ -24,8 +24,9 @@ from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.report import facts as facts_module
 from agalign.report.charts import CHART_HEIGHT, drifts_of, hues_of, rig_views
-from agalign.report.facts import CameraOffsets, PairTotals
+from agalign.report.facts import CameraOffsets
 from agalign.report.pages import pages_exist, write_pages
+from agalign.report.pair_totals import PairTotals
 from agalign.report.terms import PAGES, TERMS
 from agalign.spectral_indices.indices_csv import update_table
 from agalign.spectral_indices.rasters import IndexReport
