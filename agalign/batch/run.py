@@ -75,10 +75,10 @@ class Listener:
     """How many finished captures are estimated or rendered again, and why; called before any is replaced."""
     on_problem: Callable[[str], object] = quiet
     """Why a file is not in the pages, which are written at the end of the run."""
-    on_pages: Callable[[PairTotals], object] = quiet
-    """The band pairs in the pages; not called if the pages of an earlier run are kept."""
-    on_lost: Callable[[str], object] = quiet
-    """Label of a capture whose files were removed after it was reported; called at the end of the run."""
+    on_end: Callable[[RunPart, PairTotals | None], object] = quiet
+    """The record of the run, and the band pairs in its pages; None if those of an earlier run are kept, or if there are
+    none.
+    """
 
 
 def run_flight(
@@ -143,7 +143,6 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     gone.append(label)
                     finished[label] = Finished("error")
                     record.add_problem(label, f"its files were removed during the run; {again}")
-                    run.listener.on_lost(label)
             record.count(finished)
         if gone:
             what = f"outputs of {counted(len(gone), 'capture')} were removed during the run, such as of {gone[0]}"
@@ -359,16 +358,18 @@ class _FlightRun:
 
         Raises OutputError.
         """
-        is_kept = record.captures.keys() <= {"found", "kept"}
+        is_kept, pairs = record.captures.keys() <= {"found", "kept"}, None
         if not is_kept or (earlier is not None and not record.has_same_results(earlier)):
             outdate_pages(self.out)
-        record.end(self.out, state, seconds, earlier)
         try:
+            record.end(self.out, state, seconds, earlier)
             if not pages_exist(self.out):
-                self.listener.on_pages(write_pages(self.out, self.listener.on_problem).pairs)
+                pairs = write_pages(self.out, self.listener.on_problem).pairs
         except MemoryError:
             text = f"{self.out}: the report does not fit into memory; 'agalign report {self.out}' writes it elsewhere"
             logging.getLogger(__name__).warning(text)
+        finally:
+            self.listener.on_end(record, pairs)
 
     def _plan(self, captures: Sequence[Capture]) -> "_Plan":
         """Compare the captures with the results of earlier runs."""

@@ -6,7 +6,7 @@ The commands import this module when they run, because the libraries that it nee
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from agalign.flight.groups import camera_overviews
 from agalign.host.files import REPORT_FILE
 from agalign.host.text import counted, escape_controls
 from agalign.records.excluded import exclusions, last_excluded
-from agalign.records.run_record import read_run_record
+from agalign.records.run_record import RunPart
 from agalign.records.sidecar import BandResult
 from agalign.report.pages import pair_totals
 from agalign.report.pair_totals import PairTotals
@@ -103,14 +103,14 @@ class RunTotals:
 
     is_complete: bool
     """All captures are good, no file has a problem, and the report is written."""
-    asked: dict[str, int] = field(default_factory=dict)
+    asked: dict[str, int]
     """Number of band pairs of each capture."""
-    excluded: set[str] = field(default_factory=set)
-    """Labels of the captures that are not aligned, as they show a panel or the sky."""
-    states: Counter[str] = field(default_factory=Counter)
-    """Number of captures by state."""
-    written: dict[str, str] = field(default_factory=dict)
-    """State of each capture with a result, by label."""
+    record: RunPart | None = None
+    """That of the run, which has counted its captures; None until its end."""
+    finished: int = 0
+    """Number of captures that were reported."""
+    skipped: int = 0
+    """Number of those that needed no time."""
     pairs: PairTotals = field(default_factory=PairTotals)
     """All band pairs below the output folder, as the report counts them; known at the end of the run."""
     removed: dict[str, list[Path]] = field(default_factory=lambda: defaultdict(list))
@@ -120,23 +120,24 @@ class RunTotals:
 
     def add(self, report: "CaptureReport") -> None:
         """Add the report of a capture."""
-        self.states[report.state] += 1
+        self.finished += 1
+        self.skipped += report.state in ("kept", "panel", "sky")
         self.is_complete &= report.is_complete
         for path, reason in report.removed:
             self.removed[reason].append(path)
-        if report.state in ("panel", "sky"):
-            self.excluded.add(report.label)
-        if report.result is None:
-            return
-        self.written[report.label] = report.state
-        output = report.result.output
+        output = None if report.result is None else report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
 
-    def lose(self, label: str) -> None:
-        """Count a capture whose files were removed during the run as an error."""
-        if (state := self.written.pop(label, None)) is not None:
-            self.states = +(self.states + Counter(error=1) - Counter([state]))
+    def end(self, record: RunPart, pairs: PairTotals | None) -> None:
+        """Keep the record of the run at its end, and the band pairs in the report if it was written."""
+        self.record, self.pairs = record, pairs or self.pairs
+
+    @property
+    def states(self) -> Counter[str]:
+        """Number of captures by state, after the end of the run."""
+        counts = Counter[str]() if self.record is None else self.record.captures
+        return counts - Counter(found=counts["found"])
 
 
 def run(
@@ -157,32 +158,29 @@ def run(
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
     totals, problems, started = RunTotals(flight.is_complete, asked), list[str](), time.monotonic()
-    counted_pairs: list[PairTotals] = []
     with cluster(dask, options.jobs) as executor, progress(terminal, len(flight.captures)) as show_line:
         options = replace(options, executor=executor)
 
         def show(share: float, text: str) -> None:
-            skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
-            show_line(totals.states.total() + share, text, skipped)
+            show_line(totals.finished + share, text, totals.skipped)
 
-        listener = replace(
-            _listener(terminal, show), on_problem=problems.append, on_pages=counted_pairs.append, on_lost=totals.lose
-        )
+        listener = replace(_listener(terminal, show), on_problem=problems.append, on_end=totals.end)
         try:
             with closing(run_flight(flight, out, settings, options, listener, model)) as reports:
                 for report in reports:
                     terminal.check()
                     totals.add(report)
                     show(0.0, report.label)
-                    _print_report(report, terminal, totals.states.total(), len(flight.captures))
+                    _print_report(report, terminal, totals.finished, len(flight.captures))
         except (OutputError, WorkerError) as error:
-            if not totals.states:
+            if not totals.finished:
                 raise
             problems.append(str(error))
     for problem in problems:
         terminal.problem(problem)
     totals.is_complete &= not problems
-    totals.pairs = counted_pairs[0] if counted_pairs else pair_totals(out)
+    if not totals.pairs.captures:  # the report of an earlier run is kept
+        totals.pairs = pair_totals(out)
     seconds = round(time.monotonic() - started, 1)
     terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)
     return totals
@@ -306,45 +304,46 @@ def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
 
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
-    _print_totals(totals, terminal)
+    excluded = [part for parts in last_excluded(out) for part in parts if part.is_left_out]
+    _print_totals(totals, {part.label for part in excluded}, terminal)
     for reason, paths in totals.removed.items():
         terminal.problem(f"{counted(len(paths), 'file')} of an earlier command removed, such as {paths[0]}: {reason}")
-    panels, sky = last_excluded(out)
-    for line in exclusions(part for part in (*panels, *sky) if part.label in totals.excluded):
+    for line in exclusions(excluded):
         terminal.result(line)
-    record = read_run_record(out)
-    for line in [] if record is None else record.notes_on_input():
+    for line in [] if totals.record is None else totals.record.notes_on_input():
         terminal.problem(f"{out}: {line}")
     if (out / REPORT_FILE).is_file():
         terminal.result(f"Report: {out / REPORT_FILE}")
-    if totals.states and set(totals.states) <= {"panel", "sky"}:
-        or_sky = " or the sky" if totals.states["sky"] else ""
+    states = totals.states
+    if states and states.keys() <= {"panel", "sky"}:
+        or_sky = " or the sky" if states["sky"] else ""
         terminal.problem(f"all captures show calibration panels{or_sky}; --align-panels aligns them like any other")
         return ExitCode.NOTHING
-    if not totals.written:
+    if not states["done"] + states["kept"]:
         terminal.problem("no capture could be processed")
         return ExitCode.NOTHING
     statuses = totals.pairs.statuses
     if not statuses["aligned"] + statuses["predicted"]:
         terminal.problem("no band pair could be aligned")
         return ExitCode.PARTIAL
-    of_run = set(map(escape_controls, totals.written))  # the report may count results of other runs too
+    of_run = set(map(escape_controls, totals.asked))  # the report may count results of other runs too
     is_usable = not any(b.is_unusable and b.capture in of_run for group in totals.pairs.groups() for b in group.bands)
     return ExitCode.OK if totals.is_complete and is_usable else ExitCode.PARTIAL
 
 
-def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
-    statuses, finished = totals.pairs.statuses, totals.written.keys() | totals.excluded
-    unfinished = [label for label in totals.asked if label not in finished]
-    # One may have a result of an earlier run.
-    uncounted = [label for label in unfinished if escape_controls(label) not in totals.pairs.captures]
-    asked, lost = statuses.total() + sum(totals.asked[label] for label in uncounted), len(unfinished)
+def _print_totals(totals: RunTotals, excluded: Collection[str], terminal: Terminal) -> None:
+    """Print the table of bands, what to check and what was not written, given the captures that are not aligned."""
+    statuses, captures, states = totals.pairs.statuses, totals.pairs.captures, totals.states
+    uncounted = [label for label in totals.asked if escape_controls(label) not in captures and label not in excluded]
+    asked = statuses.total() + sum(totals.asked[label] for label in uncounted)
+    written = states["done"] + states["kept"]
+    lost = len(totals.asked) - written - states["panel"] - states["sky"]  # one may have a result of an earlier run
     if statuses:
         missing = f"; {counted(lost, 'capture')} not written" if lost else ""
         _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
     explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(lost + len(totals.written), 'capture')}"
+        of_all = f"{lost} of {counted(lost + written, 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; mend them, and repeat the command")
     for quantity, ages_s in totals.panel_ages_s.items():
         age_s = max((one for one in ages_s if one is not None), default=None)

@@ -24,9 +24,12 @@ from agalign.cli import align_run, main
 from agalign.cli.align_run import RunTotals, conclude, print_problems
 from agalign.cli.command import Command, help_of
 from agalign.cli.terminal import Terminal, exits
-from agalign.config import RunOptions
+from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
+from agalign.host.files import PANELS_FILE, write_model
 from agalign.records.cautions import RunFacts
+from agalign.records.excluded import PanelPart, PanelsFile
+from agalign.records.run_record import Finished, RunPart, begun
 from agalign.records.sidecar_file import write_sidecar
 from agalign.report.pages import pair_totals
 from agalign.report.pair_totals import PairTotals
@@ -298,6 +301,13 @@ def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[s
     assert len(capsys.readouterr().err.splitlines()) == 4001
 
 
+def record_of(**states: str) -> RunPart:
+    """The record of a run with captures in these states."""
+    record = begun(Path(), Settings())
+    record.count({label: Finished(state) for label, state in states.items()})
+    return record
+
+
 @pytest.mark.parametrize(
     ("radiometry", "age_s", "text"),
     [
@@ -311,7 +321,7 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     radiometry: str, age_s: float | None, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
-    totals = RunTotals(True)
+    totals = RunTotals(True, {"IMG_1": 2}, record_of(IMG_1="done"))
     few_saturated = NIR | {"reason": None, "saturated": 0.001}
     sidecar = example(output=output | {"panel_age_s": age_s}, bands=[few_saturated])
     totals.add(CaptureReport("IMG_1", "done", sidecar, tmp_path / "IMG_1.json"))
@@ -329,7 +339,8 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of a disk that is full after the third of four captures, which shows a panel."""
-    totals = RunTotals(False, {f"IMG_{number}": 2 for number in range(4)})
+    record = record_of(IMG_0="done", IMG_1="done", IMG_2="panel")
+    totals = RunTotals(False, {f"IMG_{number}": 2 for number in range(4)}, record)
     blue = {"band": "Blue", "file": "b.tif", "band_index": 1, "width": 10, "height": 8}
     aligned = NIR | {"status": "aligned", "reason": None}
     complete = example(capture="IMG_0", bands=[aligned | {"saturated": 0.031}, aligned | {"band": "Red"}])
@@ -337,7 +348,9 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(
     for sidecar in (other, complete):  # in the order in which they finish
         path = tmp_path / f"{sidecar.capture}.json"
         totals.add(CaptureReport(sidecar.capture, "done", write_sidecar(path, sidecar), path))
-    totals.add(CaptureReport("IMG_2", "panel", panel="a calibration panel"))
+    facts = {"folder": ".", "capture": "IMG_2", "captured_at": "", "cues": ["its name"], "bands": []}
+    part = PanelPart.model_validate(facts | {"seen_by": "look", "serial": "", "picture": "IMG_2.png"})
+    write_model(tmp_path / PANELS_FILE, PanelsFile(panels=[part]))
     totals.pairs = pair_totals(tmp_path)
     assert [label for label, *_ in totals.pairs._references] == ["IMG_0", "IMG_1"], "that of the report"
     assert conclude(totals, tmp_path, Terminal()) == 3
@@ -353,7 +366,8 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(
 @pytest.mark.parametrize(("of_run", "code"), [("IMG_1", 0), ("IMG_2", 3)])
 def test_the_exit_code_is_that_of_the_captures_of_the_run(of_run: str, code: int, tmp_path: Path) -> None:
     """The other one is a result of an earlier run, which is listed."""
-    totals = RunTotals(True, {of_run: 1}, written={of_run: "done"}, pairs=PairTotals(RunFacts((panel(NIR=15.46),))))
+    pairs = PairTotals(RunFacts((panel(NIR=15.46),)))
+    totals = RunTotals(True, {of_run: 1}, record_of(**{of_run: "done"}), pairs=pairs)
     aligned = NIR | {"status": "aligned", "reason": None}
     totals.pairs.add("IMG_1", example(bands=[aligned]))
     by_sensor = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": "reflectance by light sensor"}
