@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -25,28 +24,6 @@ _HUES: Mapping[Role, float] = {"blue": 215, "green": 130, "red": 0, "red edge": 
 """Degrees: the colours of the bands, and two that no visible band has for those that the eye does not see."""
 _FREE_HUES = 45, 180, 85, 250, 20, 300, 155, 235
 """For other bands, in their order."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """One band over a flight, as drawn in a chart."""
-
-    name: str
-    hue: float
-    points: tuple[str, ...]
-    """The `points` of an SVG polyline for each sequence of captures in which the band is known."""
-
-
-@dataclass(frozen=True)
-class DriftChart:
-    """Offsets of the bands of a camera over its captures, in the order of time."""
-
-    title: str
-    full_px: float
-    """Offset at the upper end of the axis."""
-    lines: tuple[Line, ...]
-    ends: tuple[str, str]
-    """Labels of the first and the last capture."""
 
 
 def rig_views(out: Path, on_problem: Callable[[str], object]) -> list[dict[str, Any]]:
@@ -105,8 +82,14 @@ def hues_of(bands: Sequence[str]) -> dict[str, float]:
     return hues
 
 
-def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
-    """Return a chart of the offsets, px, for each camera with three captures or more, given by name."""
+def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[dict[str, Any]]:
+    """Return a chart of the offsets, px, over the captures in the order of time, for each camera with three captures or
+    more, given by name.
+
+    Each has `title`, `full_px` at the upper end of the axis, `ends`, which are the labels of the first and the last
+    capture, and `lines`: `name` and `hue` of a band, and `points` of an SVG polyline for each sequence of captures in
+    which it is known.
+    """
     result = []
     for camera, known in cameras.items():
         order = sorted(range(len(known.labels)), key=known.labels.__getitem__)
@@ -125,12 +108,12 @@ def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
         full_px = float(np.nanmax(np.abs(aligned), initial=min_full_px))
         step = max(1, math.ceil(len(order) / 400))  # more points than that are not distinguishable
         hues = hues_of([known.reference, *names])  # as in the plan of the rig
-        lines = (
-            Line(name, hues[name], _polylines(of_band, full_px, step))
+        lines = [
+            {"name": name, "hue": hues[name], "points": _polylines(of_band, full_px, step)}
             for name, of_band in zip(names, aligned, strict=True)
-        )
+        ]
         ends = known.labels[order[0]][1], known.labels[order[-1]][1]
-        result.append(DriftChart(f"{camera} from capture to capture", full_px, tuple(lines), ends))
+        result.append({"title": f"{camera} from capture to capture", "full_px": full_px, "lines": lines, "ends": ends})
     return result
 
 

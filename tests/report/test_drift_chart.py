@@ -16,4 +16,4 @@ def test_the_memory_is_proportional_to_the_number_of_captures() -> None:
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak_bytes < 1000 * count
-    assert chart.ends == ("00000", "03999")
+    assert chart["ends"] == ("00000", "03999")

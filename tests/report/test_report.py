@@ -475,10 +475,10 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     # In the order of time, whatever that of the captures is.
     known = CameraOffsets(labels[::-1], offsets[::-1])
     (drift,) = drifts_of({"camera": known})
-    assert drift.ends == ("00", "06")
-    assert drift.full_px == pytest.approx(15, abs=0.01)
-    assert [len(line.points) for line in drift.lines] == [2, 1]
-    heights = [[float(p.split(",")[1]) for run in line.points for p in run.split()] for line in drift.lines]
+    assert drift["ends"] == ("00", "06")
+    assert drift["full_px"] == pytest.approx(15, abs=0.01)
+    assert [len(line["points"]) for line in drift["lines"]] == [2, 1]
+    heights = [[float(p.split(",")[1]) for run in line["points"] for p in run.split()] for line in drift["lines"]]
     ends = sorted((heights[0][0], heights[0][-1]))
     assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
     # Along the same baseline in the other direction, a band is drawn next to the first, not opposite to it.
