@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
-from agalign.host.text import counted, escape_controls
+from agalign.host.text import escape_controls
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -180,10 +180,8 @@ def explain(groups: "Sequence[CautionGroup]", terminal: Terminal) -> None:
             name = f"{first.capture} {first.band}".rstrip()
             text, named = f"{name}: {status}: {first.reason}", []
         else:
-            bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
-            what = captures if group.status == "no_result" else f"{bands} of {captures}"
             size = f" ({group.size})" if group.size else ""
-            text = f"{status}: {what}: {group.remedy.cause}{size}"
+            text = f"{status}: {group.count}: {group.remedy.cause}{size}"
             names = [f"{b.capture} {b.band}".rstrip() for b in group.bands]
             more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
             named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]

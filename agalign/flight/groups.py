@@ -8,6 +8,7 @@ from typing import Self
 
 from agalign.cameras.grouping import usual_bands
 from agalign.host.files import file_name
+from agalign.host.text import counted
 from agalign.pixels.radiometry import with_radiometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
@@ -146,9 +147,8 @@ class CameraOverview:
     @property
     def text(self) -> str:
         """The overview in one line."""
-        count = f"{self.captures} capture{'' if self.captures == 1 else 's'}"
-        serial = f" ({self.serial})" if self.serial else ""
-        parts = [f"{self.camera}{serial}: {count} of {len(self.bands)} bands", "{} x {} px".format(*self.size_px)]
+        serial, captures = f" ({self.serial})" if self.serial else "", counted(self.captures, "capture")
+        parts = [f"{self.camera}{serial}: {captures} of {len(self.bands)} bands", "{} x {} px".format(*self.size_px)]
         if self.gsd_m is not None and self.height_m is not None:
             parts.append(f"GSD {100 * self.gsd_m:.1f} cm from {self.height_m:.0f} m above the ground")
         elif self.altitude_m is not None:

@@ -19,7 +19,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
-from agalign.host.text import escape_controls
+from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
 from agalign.records.excluded import PanelPart, SkyPart, exclusions, read_excluded
 from agalign.records.listed_files import ListedFiles
@@ -172,6 +172,7 @@ def _page(**values: Any) -> str:
     of_every_page = {
         "version": __version__,
         "median": median,
+        "counted": counted,
         "terms": TERMS,
         "pages": PAGES,
         "max_listed": _MAX_LISTED,

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
+from agalign.host.text import counted
 from agalign.records.cautions import Caution, RunFacts
 from agalign.records.sidecar import BandResult, Sidecar
 from agalign.report.light_over_captures import LightOverCaptures
@@ -63,6 +64,12 @@ class CautionGroup:
     def captures(self) -> int:
         """Number of captures with such a band."""
         return len({b.capture for b in self.bands})
+
+    @property
+    def count(self) -> str:
+        """The number of its bands and captures, in words."""
+        captures = counted(self.captures, "capture")
+        return captures if self.status == "no_result" else f"{counted(len(self.bands), 'band')} of {captures}"
 
 
 @dataclass
