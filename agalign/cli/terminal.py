@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
-from agalign.host.text import escape_controls
+from agalign.host.text import escape_controls, some_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -182,9 +182,8 @@ def explain(groups: "Sequence[CautionGroup]", terminal: Terminal) -> None:
         else:
             size = f" ({group.size})" if group.size else ""
             text = f"{status}: {group.count}: {group.remedy.cause}{size}"
-            names = [f"{b.capture} {b.band}".rstrip() for b in group.bands]
-            more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
-            named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
+            names = some_of((f"{b.capture} {b.band}".rstrip() for b in group.bands), max_named)
+            named = [f"{names}: {first.reason}"]
         facts = {"bands": len(group.bands), "captures": group.captures, "advice": group.advice}
         facts |= {"cause": group.remedy.cause, "size": group.size, "effect": round(group.effect, 4)}
         terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **facts)

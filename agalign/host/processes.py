@@ -40,22 +40,22 @@ def limit_default_threads() -> None:
             os.environ.setdefault(name, str(usable_cores()))
 
 
-def cgroup_quota(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float | None:
+def cgroup_quota() -> float | None:
     """Return the smallest quota of this process's control group and those above it, in cores; None for no limit.
 
     Version 2 has the file `cpu.max` ("200000 100000": quota and period in microseconds), version 1 one file for each.
     """
-    quotas = map(_quota_in, _cgroup_folders("cpu", root, own))
+    quotas = map(_quota_in, _cgroup_folders("cpu"))
     return min((quota for quota in quotas if quota is not None), default=None)
 
 
-def _cgroup_folders(controller: str, root: Path, own: Path) -> list[Path]:
+def _cgroup_folders(controller: str) -> list[Path]:
     """The folders of this process's control group and those above it, of both versions."""
-    folders = [root, root / controller]  # a container sees its own group as the root
-    for line in _text(own).splitlines():
+    folders = [_CGROUPS, _CGROUPS / controller]  # a container sees its own group as the root
+    for line in _text(_OWN_CGROUP).splitlines():
         _, controllers, path = line.split(":", 2)
         if not controllers or controller in controllers.split(","):
-            group = (root / controller if controllers else root) / path.lstrip("/")
+            group = (_CGROUPS / controller if controllers else _CGROUPS) / path.lstrip("/")
             folders += [group, *group.parents]
     return folders
 
@@ -78,12 +78,12 @@ def _text(path: Path) -> str:
         return ""
 
 
-def memory_limit_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float:
+def memory_limit_bytes() -> float:
     """Return the smallest limit of the memory of this process's control groups; inf without one. Version 1 has a limit
     above the memory of any machine instead.
     """
     files = ("memory.max", "memory.limit_in_bytes")
-    texts = (_text(folder / name).strip() for folder in _cgroup_folders("memory", root, own) for name in files)
+    texts = (_text(folder / name).strip() for folder in _cgroup_folders("memory") for name in files)
     return min((float(text) for text in texts if text.isdecimal()), default=math.inf)
 
 

@@ -12,10 +12,11 @@ def counted(number: int, what: str) -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
-def some_of(names: Iterable[str]) -> str:
-    """Return the first six of several names, for a message."""
-    max_names, known = 6, list(names)
-    return ", ".join(known[:max_names]) + (", …" if len(known) > max_names else "")
+def some_of(names: Iterable[str], max_names: int = 6) -> str:
+    """Return the first of several names, and the number of the others, for a message."""
+    known = list(names)
+    more = len(known) - max_names
+    return ", ".join(map(shortened, known[:max_names])) + (f" and {more:,} more" if more > 0 else "")
 
 
 def did_you_mean(text: str, choices: Iterable[str]) -> str:

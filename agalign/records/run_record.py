@@ -19,13 +19,15 @@ from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.host.files import RUN_FILE, read_model, read_regular, write_model
 from agalign.host.libraries import library_versions
 from agalign.host.processes import usable_cores
-from agalign.host.text import counted, escape_controls, shortened
+from agalign.host.text import counted, escape_controls, shortened, some_of
 from agalign.records.excluded import ExcludedPart
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import label_of
 from agalign.values.capture import Capture
 
 _SCHEMA = "agalign-run/2"
+_MAX_NAMED = 10
+"""Captures that a sentence names."""
 RunState = Literal["running", "interrupted", "finished"]
 
 
@@ -132,10 +134,10 @@ class RunPart(_Part):
         lines = []
         if gone:
             have = f"{counted(len(gone), 'capture')} of earlier runs {'is' if len(gone) == 1 else 'are'}"
-            lines.append(f"{have} not in the input of the last run, and still counted: {_named(gone)}")
+            lines.append(f"{have} not in the input of the last run, and still counted: {some_of(gone, _MAX_NAMED)}")
         if twice:
             have = f"{counted(len(twice), 'capture')} of earlier runs {'has' if len(twice) == 1 else 'have'}"
-            lines.append(f"{have} another name in the input, and not counted twice: {_named(twice)}")
+            lines.append(f"{have} another name in the input, and not counted twice: {some_of(twice, _MAX_NAMED)}")
         return [f"{line}; delete the files that are not needed" for line in lines]
 
     def end(self, out: Path, state: RunState, seconds: float, earlier: "RunPart | None") -> None:
@@ -256,17 +258,11 @@ class UnfinishedRun:
         parts, of_all = [states[self.state]] if self.state in states else [], f"of {counted(self.found, 'capture')}"
         if self.missing:
             verb = "has" if len(self.missing) == 1 else "have"
-            parts.append(f"{len(self.missing)} {of_all} {verb} no result: {_named(self.missing)}")
+            parts.append(f"{len(self.missing)} {of_all} {verb} no result: {some_of(self.missing, _MAX_NAMED)}")
         if self.erroneous:
             what = f"errors in {len(self.erroneous)} {of_all}, whose files may be of an earlier run"
-            parts.append(f"{what}: {_named(self.erroneous)}")
+            parts.append(f"{what}: {some_of(self.erroneous, _MAX_NAMED)}")
         return "; ".join([*parts, "the same command resumes it"]) if parts else ""
-
-
-def _named(labels: Sequence[str]) -> str:
-    max_named = 10
-    more = len(labels) - max_named
-    return ", ".join(map(shortened, labels[:max_named])) + (f" and {more} more" if more > 0 else "")
 
 
 def unfinished_run(

@@ -13,6 +13,14 @@ from agalign.host import processes
 from agalign.host.processes import cgroup_quota, limit_default_threads, memory_limit_bytes, usable_cores
 
 
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the control groups."""
+    monkeypatch.setattr(processes, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(processes, "_OWN_CGROUP", tmp_path / "self")
+    return tmp_path
+
+
 def write_cgroups(root: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -34,9 +42,9 @@ V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
         ("4:memory:/docker/other\n3:cpu,cpuacct:/docker/ab", V1 | {"cpu/docker/ab/cpu.cfs_quota_us": "50000"}, 0.5),
     ],
 )
-def test_quota_of_a_container(tmp_path: Path, groups: str, files: dict[str, str], expected: float | None) -> None:
-    write_cgroups(tmp_path, {"self": groups, **files})
-    assert cgroup_quota(tmp_path, tmp_path / "self") == expected
+def test_quota_of_a_container(root: Path, groups: str, files: dict[str, str], expected: float | None) -> None:
+    write_cgroups(root, {"self": groups, **files})
+    assert cgroup_quota() == expected
 
 
 @pytest.mark.parametrize(
@@ -47,9 +55,9 @@ def test_quota_of_a_container(tmp_path: Path, groups: str, files: dict[str, str]
         ("4:memory:/docker/ab", {"memory/docker/ab/memory.limit_in_bytes": "1000000000"}, 1e9),
     ],
 )
-def test_memory_limit_of_a_container(tmp_path: Path, groups: str, files: dict[str, str], expected: float) -> None:
-    write_cgroups(tmp_path, {"self": groups, **files})
-    assert memory_limit_bytes(tmp_path, tmp_path / "self") == expected
+def test_memory_limit_of_a_container(root: Path, groups: str, files: dict[str, str], expected: float) -> None:
+    write_cgroups(root, {"self": groups, **files})
+    assert memory_limit_bytes() == expected
 
 
 @pytest.mark.parametrize(("quota", "expected"), [(None, 8), (2.5, 3), (0.2, 1), (64.0, 8)])
