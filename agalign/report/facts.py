@@ -16,6 +16,7 @@ import numpy as np
 from agalign.errors import ConfigurationError
 from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.host.text import escape_controls
+from agalign.rasters.preview import ERROR_FULL_PX
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
@@ -23,7 +24,7 @@ from agalign.report.page_data import DataParts
 from agalign.report.pair_totals import CautionGroup, PairTotals, usable_bands
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
 from agalign.spectral_indices.formulas import index_named
-from agalign.spectral_indices.rasters import IndexReport, reason_not_written
+from agalign.spectral_indices.rasters import PICTURE_PX, IndexReport, reason_not_written
 from agalign.values.alignment import Prediction
 from agalign.values.remedies import NO_RESULT
 
@@ -174,6 +175,8 @@ class FlightFacts:
             "captures": self.statuses.total(),
             "shift_step_px": _SHIFT_STEP_PX,
             "min_share_over_1_px": MIN_SHARE_OVER_1_PX,
+            "error_full_px": ERROR_FULL_PX,
+            "index_picture_px": PICTURE_PX,
             "rows": self._rows.first,
             "details": self._details.first,
             "details_per_part": _DETAILS_PER_PART,

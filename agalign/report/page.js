@@ -38,8 +38,10 @@
  * @typedef {{from: number, records: Row[]}} Rows
  * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
  *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
- * @typedef {{captures: number, shift_step_px: number, min_share_over_1_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
- *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others.
+ * @typedef {{captures: number, shift_step_px: number, min_share_over_1_px: number, error_full_px: number, index_picture_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
+ *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others. The
+ *   colours of errors and residuals are full at `error_full_px`; `index_picture_px` is the longer side of the image in the
+ *   picture of an index, above the histogram.
  * @typedef {{column: number, colour: string}} Channel
  * @typedef {"before" | "after"} When
  * @typedef {[text: string, term?: string]} Head The head of a column, and its term in the help of the page.
@@ -499,7 +501,6 @@ function ramp(share) {
 
 const CHANNELS = ["#f00", "#0f0", "#00f"];
 const LARGEST_ZOOM = 40;
-const ERROR_FULL_PX = 2; // a residual's colour is full, as in the previews: twice the limit for any use
 const ERROR_MARKS_PX = [0, 0.5, 1, 2];
 const SMALL = [0, 32, 77]; // colours of errors; no vegetation has them, neither in true nor in false colour
 const LARGE = [255, 234, 70];
@@ -507,7 +508,6 @@ const ARROW_FULL_PX = 0.5; // the arrow of a residual is full
 const FAR = [25, 35, 150]; // colours of the relief; between them the lightness grows with the parallax
 const NEAR = [205, 250, 45];
 const INDEX_OPACITY = 0.9;
-const INDEX_PICTURE_PX = 720; // longer side of the image in the picture of an index; the histogram is below it
 const MAP_OPACITY = 0.75; // of errors and relief: edges of the picture show through
 /** @type {Record<string, string>} */
 const NOTES = {
@@ -780,7 +780,7 @@ function reliefColour(share) {
 }
 
 /** @param {number} px An expected error, or the length of a residual. @param {number} [full_px] */
-function errorColour(px, full_px = ERROR_FULL_PX) {
+function errorColour(px, full_px = facts.error_full_px) {
   return mixed(SMALL, LARGE, Math.min(1, px / full_px));
 }
 
@@ -884,7 +884,7 @@ function channelNote(capture) {
  */
 function legend(preview) {
   if (["vectors", "heat", "error"].includes(look.overlay)) {
-    const full_px = look.overlay === "error" ? preview.error_full_px ?? 0 : ERROR_FULL_PX;
+    const full_px = look.overlay === "error" ? preview.error_full_px ?? 0 : facts.error_full_px;
     return ERROR_MARKS_PX.filter((px) => px <= full_px).map((px) => key(errorColour(px, full_px), `${px} px${px === full_px ? " and more" : ""}`));
   }
   const index = look.capture ? indexOf(look.capture) : undefined;
@@ -994,7 +994,7 @@ function overIndex(pen, capture, at) {
   const image = look.indices[index.name];
   if (!image.complete || !image.naturalWidth) return;
   const [, , width, height] = capture.crop;
-  const scale = Math.min(1, INDEX_PICTURE_PX / Math.max(width, height));
+  const scale = Math.min(1, facts.index_picture_px / Math.max(width, height));
   const [x, y] = at(0, 0);
   const [right, bottom] = at(1, 1);
   pen.globalAlpha = INDEX_OPACITY;

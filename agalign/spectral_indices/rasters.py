@@ -39,6 +39,8 @@ from agalign.values.image import Tile, reduced_size_px
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
 
+PICTURE_PX = 720
+"""Longer side of the image at the top left of a picture, which the report overlays on the composite."""
 _STATISTICS_TAG = "INDEX_STATISTICS"
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
@@ -475,9 +477,7 @@ def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: I
     """
     with open_raster(raster) as dataset:
         size_px = dataset.width, dataset.height
-        # Longer side of the image at the top left of the picture; the report overlays it on the composite.
-        picture_px = 720
-        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / picture_px))[::-1])
+        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / PICTURE_PX))[::-1])
     span, ramp = (statistics.low, statistics.high), _NEUTRAL if statistics.unit == RAW else _COLOURS
     shape = values.shape
     width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
