@@ -3,9 +3,10 @@ longer has.
 """
 
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -269,34 +270,30 @@ def results_not_in_input(
     are a capture of this run. Images that exist, and are not selected, are in the input.
     """
     own, others = {c.label for c in flight.captures}, {label for labels in other_inputs.values() for label in labels}
-    exposures: _Exposures | None = None
+    by_sample = cache(partial(_labels_by_sample, flight.captures))
     for path in find_sidecars(out):
         if (label := label_of(path, out)) in own:
             continue
         with suppress(SidecarError):  # named by the commands that read it
             result = read_checked(path).without_tables()
-            exposures = exposures or _Exposures(flight.captures)
-            if same := exposures.same_as(result):
+            if same := _same_exposure(result, flight.captures, by_sample):
                 yield NotInInputPart(capture=label, same_as=same)
             elif label not in others and not any((flight.folder / b.file).is_file() for b in result.bands):
                 yield NotInInputPart(capture=label)
 
 
-class _Exposures:
-    """The captures of a run by what identifies their exposure: the id in the tags, else the contents of a file."""
+def _same_exposure(result: Sidecar, captures: Sequence[Capture], by_sample: Callable[[], Mapping[str, str]]) -> str:
+    """Return the label of the capture that is the same exposure as a result, by the id in the tags, else by the
+    contents of a file, as `_labels_by_sample`; empty if there is none.
+    """
+    if result.capture_id:
+        of_id = (c for c in captures if c.capture_id == result.capture_id and is_same(result, c))
+        return next((c.label for c in of_id), "")
+    return next((by_sample()[sample] for sample in result.input_samples.values() if sample in by_sample()), "")
 
-    def __init__(self, captures: Sequence[Capture]) -> None:
-        self._captures = captures
-        self._by_sample: dict[str, str] | None = None
-        """Labels; a renamed file may have another spelling of its band."""
 
-    def same_as(self, result: Sidecar) -> str:
-        """Return the label of the capture that is the same exposure as a result; empty if there is none."""
-        if result.capture_id:
-            of_id = (c for c in self._captures if c.capture_id == result.capture_id and is_same(result, c))
-            return next((c.label for c in of_id), "")
-        if self._by_sample is None:
-            without_id = [c for c in self._captures if not c.capture_id]
-            self._by_sample = {sample: c.label for c in without_id for sample in input_samples(c).values()}
-        by_sample = self._by_sample
-        return next((by_sample[sample] for sample in result.input_samples.values() if sample in by_sample), "")
+def _labels_by_sample(captures: Iterable[Capture]) -> dict[str, str]:
+    """Return the labels of captures without an id by the contents of their files: a renamed file may have another
+    spelling of its band.
+    """
+    return {sample: c.label for c in captures if not c.capture_id for sample in input_samples(c).values()}

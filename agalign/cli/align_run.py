@@ -326,8 +326,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     if not statuses["aligned"] + statuses["predicted"]:
         terminal.problem("no band pair could be aligned")
         return ExitCode.PARTIAL
-    of_run = set(map(escape_controls, totals.asked))  # the report may count results of other runs too
-    is_usable = not any(b.is_unusable and b.capture in of_run for group in totals.pairs.groups() for b in group.bands)
+    # The report may count results of other runs too.
+    is_usable = totals.pairs.unusable_captures.isdisjoint(map(escape_controls, totals.asked))
     return ExitCode.OK if totals.is_complete and is_usable else ExitCode.PARTIAL
 
 

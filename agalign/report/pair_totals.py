@@ -148,6 +148,11 @@ class PairTotals:
         return {label for label, *_ in self._references}
 
     @property
+    def unusable_captures(self) -> set[str]:
+        """Labels of the captures with a band whose values are too uncertain for any use."""
+        return {caution.capture for caution in self._cautions if caution.is_unusable}
+
+    @property
     def largest(self) -> ExpectedError | None:
         """The largest expected error of a usable band, px of the reference; None if none is known."""
         known = (band.largest for band in self.bands.values() if band.largest is not None)
