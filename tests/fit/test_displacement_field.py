@@ -61,20 +61,6 @@ def test_the_p95_before_and_after_a_field_are_over_the_same_windows(monkeypatch:
     assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px < 0.3
 
 
-def test_a_field_that_does_not_predict_held_out_windows_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their p95 does not increase, but neither do their shifts decrease."""
-    fixed, moving = displaced_views(bump)
-    estimator = DisplacementEstimator(fixed.valid, structure_field(fixed))
-
-    def nothing(_shifts: Shifts, windows: Residual, _distance_px: float) -> np.ndarray:
-        return np.zeros_like(windows.centres_px)
-
-    monkeypatch.setattr(estimator, "_cross_predicted", nothing)
-    result = estimator.refine(moving, PixelMapping(np.eye(3)))
-    assert result.field is None
-    assert result.after_p95_px == result.before_p95_px > 0.9
-
-
 def test_without_windows_there_is_no_p95() -> None:
     fixed, moving = displaced_views(bump)
     estimator = DisplacementEstimator(fixed.valid, structure_field(fixed))
