@@ -15,7 +15,7 @@ from agalign.capture.by_rig import observed
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import Rig
+from agalign.flight.rig import CaptureFactors, Rig
 from agalign.pixels.raster import probe
 from agalign.synthetic.flight import score_against_truth
 from agalign.values import geometry
@@ -144,9 +144,9 @@ def test_a_rig_is_learned_from_errors_in_px_of_the_reference_s_file(flight: Path
 
 
 def test_the_error_of_a_rig_is_converted_to_px_of_the_fixed_image() -> None:
-    rig = Rig(
-        (800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {"LWIR": 0.0}, {}, (), (), {"LWIR": 5.0}
-    )
+    captures = (CaptureFactors(None, None, None, (0.0,) * 5),) * 3
+    mean, baselines = {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}
+    rig = Rig((800, 600), mean, baselines, {"LWIR": 0.0}, {}, (), captures, {"LWIR": 5.0})
     model = FlightModel(None, None, ("LWIR",), {}, "", rig)
     assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(5.0 * 0.5)
 
