@@ -33,7 +33,7 @@ from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix, PairScales
 from agalign.values.image import Raster
-from agalign.values.issues import CLOSE_WINDOWS, NO_CONTRAST, RETRIEVAL, Issue
+from agalign.values.issues import CLOSE_WINDOWS, NO_CONTRAST, RETRIEVAL, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
@@ -399,17 +399,27 @@ def test_a_blurred_band_leaves_the_relief_to_the_sharp_ones_and_follows_it(four_
     assert result["Blue"].mapping.parallax is not None
 
 
+@pytest.mark.parametrize(("kind", "is_predicted"), [(CLOSE_WINDOWS, True), (RETRIEVAL, False)])
 def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
-    candidates: Sequence[RefinedBand], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
+    candidates: Sequence[RefinedBand],
+    aligned: Mapping[str, Alignment],
+    monkeypatch: pytest.MonkeyPatch,
+    kind: IssueKind,
+    is_predicted: bool,
 ) -> None:
-    """A band that does not pass with the relief of the others is predicted by it, with the error of those windows."""
+    """A band that does not pass with the relief of the others is predicted by it, with the error of those windows,
+    if the images confirm it elsewhere.
+    """
     found = Candidate.issues.func
 
     def with_nir_failed(candidate: Candidate) -> tuple[Issue, ...]:
-        return (Issue(CLOSE_WINDOWS),) if candidate.pair.name == "NIR" else found(candidate)
+        return (Issue(kind),) if candidate.pair.name == "NIR" else found(candidate)
 
     monkeypatch.setattr(Candidate, "issues", property(with_nir_failed))
     result = aligned_by_relief(candidates, "auto")[0]
+    if not is_predicted:
+        assert "NIR" not in result
+        return
     assert {name: a.status for name, a in result.items()} == dict.fromkeys(aligned, "aligned") | {"NIR": "predicted"}
     np.testing.assert_array_equal(result["NIR"].residual.shifts_px, aligned["NIR"].residual.shifts_px)
 
