@@ -54,7 +54,7 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
         matrices = {"match": result}
     best = best_seed(pair, matrices, force)
     # A mapping by the flight or the user or a forced seed excludes other positions.
-    is_given = force is not None or pair.has_rig or "user" in pair.seed_matrices
+    is_given = settings.force is not None or pair.has_rig or "user" in pair.seed_matrices
     # Correlation peak of images that are aligned everywhere. A rotation by 1 degree reduces it to 60 to 120, by 3
     # degrees to 17.
     certain_sigma = 120.0

@@ -161,11 +161,17 @@ def test_a_rotation_is_distinguished_from_a_shift() -> None:
     assert found_rotated(shifted) is None, "a shift may be an alias"
 
 
-def test_the_user_s_seed_is_not_replaced_by_landmarks() -> None:
+@pytest.mark.parametrize(
+    ("kind", "std_px", "settings"), [("user", {"user": 3.0}, SeedSettings()), ("model", {}, SeedSettings(force="geo"))]
+)
+def test_neither_the_user_s_seed_nor_that_of_a_forced_kind_is_replaced_by_landmarks(
+    kind: SeedKind, std_px: dict[str, float], settings: SeedSettings
+) -> None:
+    """The mapping of a model without a rig is that of the captures that it was learned from, with the forced kind."""
     fixed, moving = two_views(np.eye(3))
     image, to_rotated = rotated(moving, 10)
-    seed = find_seed(pair_of(fixed, image, {"user": geometry.translation(5, 5)}, user=3.0), SeedSettings())
-    assert seed.kind in ("user", "structure")
+    seed = find_seed(pair_of(fixed, image, {kind: geometry.translation(5, 5)}, **std_px), settings)
+    assert seed.kind in (kind, "structure")
     assert mean_error_px(seed.fixed_to_moving, to_rotated, 400, 320) > 5
 
 
