@@ -35,20 +35,23 @@ class WarpedPair:
     def of(cls, pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> "WarpedPair":
         """Warp the moving image and measure the residual of `windows`.
 
-        By default these are those of the pair, or small ones if these cover more quarters of the overlap. A fit and its
-        verification must use the same windows: those of two grids share pixels, whatever their colours.
+        By default these are those of the pair, or small ones if these are measured in more quarters of the overlap. A
+        fit and its verification must use the same windows: those of two grids share pixels, whatever their colours.
         """
         warped = pair.warped_moving(mapping)
         if windows is not None:
             return cls(pair, mapping, warped, windows, windows.residuals(warped))
         usual, size_px = cls(pair, mapping, warped, pair.windows, pair.windows.residuals(warped)), pair.fixed.size_px
         in_frame_px = points_in_frame(mapping, *pair.sizes_px)
-        if not unobserved_quarters(usual.residual.centres_px, size_px, in_frame_px):
+
+        def unobserved(one: WarpedPair) -> int:
+            return len(unobserved_quarters(one.residual.measured_px, size_px, in_frame_px))
+
+        if not unobserved(usual):
             return usual
         small = pair.reference.small_windows
         smaller = replace(usual, windows=small, residual=small.residuals(warped))
-        counts = [len(unobserved_quarters(p.residual.measured_px, size_px, in_frame_px)) for p in (usual, smaller)]
-        return smaller if counts[1] < counts[0] else usual
+        return min((usual, smaller), key=unobserved)
 
     def with_mapping(self, mapping: PixelMapping) -> "WarpedPair":
         """Return the pair with another mapping; the residual is that of the same windows.
