@@ -85,6 +85,7 @@ def by_relief(
     # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
     # would follow them too.
     max_line_px = 1.0
+    with_relief: list[list[RefinedBand]] = []
     for group in parallax_groups(bands):
         if len(group) < MIN_BANDS:
             continue
@@ -92,9 +93,12 @@ def by_relief(
         if on_a_line and parallax_px > max_line_px:
             along_a_line |= {band.pair.name for band in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
-            with suppress(GeometryError):
-                relief = _observed(group) if is_observation else _of_group(group, bands)
-                result += [] if relief is None else [relief]
+            with_relief.append(group)
+    others = [band for band in bands if band.pair.name not in along_a_line]
+    for group in with_relief:
+        with suppress(GeometryError):
+            relief = _observed(group) if is_observation else _of_group(group, others)
+            result += [] if relief is None else [relief]
     return result, along_a_line
 
 
@@ -132,7 +136,9 @@ class _Band:
 
     @cached_property
     def by_homography(self) -> Residual:
-        """The residual of the held-out windows under the homography of the descriptors."""
+        """The residual of the held-out windows under the homography of the descriptors; that of the MAP estimate is
+        fitted to windows that share pixels with them.
+        """
         return self.refined.relief_check_residual(self.refined.warped.mapping)
 
     def held_out(self, relief: Relief) -> WarpedPair:

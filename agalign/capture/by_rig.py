@@ -12,7 +12,7 @@ from agalign.capture.candidate import Candidate
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import CheckSettings
-from agalign.flight.rig import Observation, Rig, distance_px
+from agalign.flight.rig import Observation, Rig, distance_px, expected_square
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, JointResult, Prediction
 from agalign.values.capture import Capture
@@ -162,7 +162,9 @@ def _parallax_by_rig(
     solution, _, rank, _ = np.linalg.lstsq(design, seen, rcond=None)
     if rank < len(solution):
         return None, 0.0
-    variance = float(np.square(seen - design @ solution).sum()) / (len(seen) - rank)
+    degrees_of_freedom = len(seen) - int(rank)
+    mean_square = float(np.square(seen - design @ solution).sum()) / degrees_of_freedom
+    variance = float(expected_square(mean_square, degrees_of_freedom))
     own = rig.baseline_design(pair.name)
     error = math.sqrt(variance * (2 + float(np.trace(own @ np.linalg.inv(design.T @ design) @ own.T))))
     x, y = (own @ solution).tolist()
@@ -183,6 +185,7 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capt
         if alignment is None or pair.name not in predictions:
             return False
         joint = alignment.joint
+        # Fewer patches than a result needs: a network of its own may retrieve more.
         is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
         has_common_structure = alignment.seed.trusted or is_above_chance
         return not has_common_structure or predictions[pair.name].of_scene.std_px <= DELIVERED_STD_PX

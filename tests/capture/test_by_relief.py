@@ -15,10 +15,11 @@ from synthetic_flights.relief import make_scene
 
 from agalign.batch.capture_task import quiet
 from agalign.capture import align_bands
+from agalign.capture import by_relief as relief_module
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import ReliefCandidates, _decreases_shifts, _Estimate, _fits_better, _std_px, by_relief
-from agalign.capture.by_rig import observed, rig_predictions
+from agalign.capture.by_rig import _parallax_by_rig, observed, rig_predictions
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
 from agalign.capture.decision import decide
@@ -237,6 +238,18 @@ def test_parallax_along_a_line_needs_a_layout() -> None:
     # No displacement field follows them either.
     for alignment in verified_together(without, Settings()).values():
         assert set(alignment.held_out_p95_px) <= {"homography"}
+
+
+def test_bands_along_a_line_do_not_follow_the_relief_of_other_bands(
+    candidates: Sequence[RefinedBand], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    *on_a_line, other = candidates[:3]
+    with_relief, offered = [other, other], list[list[RefinedBand]]()
+    monkeypatch.setattr(relief_module, "parallax_groups", lambda _: [with_relief, on_a_line])
+    monkeypatch.setattr(relief_module, "common_parallax_px", lambda group: (2.0, group is on_a_line))
+    monkeypatch.setattr(relief_module, "_of_group", lambda _, others: offered.append(others))
+    assert by_relief(candidates, "auto") == ([], {band.pair.name for band in on_a_line})
+    assert offered == [[band for band in candidates if band not in on_a_line]]
 
 
 def verified_together(bands: Sequence[RefinedBand], settings: Settings) -> dict[str, Alignment]:
@@ -478,6 +491,20 @@ def test_a_lost_band_is_predicted_with_the_relief(
     np.testing.assert_allclose(
         predictions["Blue"].mapping.parallax.baseline, aligned["Blue"].mapping.parallax.baseline, atol=0.05
     )
+
+
+def test_the_error_of_a_baseline_by_one_other_band_is_known_to_a_factor_only(
+    boxes: Rendered, candidates: Sequence[RefinedBand]
+) -> None:
+    """One band has one degree of freedom: the mean square is doubled."""
+    names, relief = [c.pair.name for c in candidates], Relief(np.full((8, 8), 2.0, np.float32), np.ones((8, 8)))
+    nothing, (own, other, *_) = dict.fromkeys(names, 0.0), [c.pair for c in candidates]
+    baselines = {**dict.fromkeys(names, (0.0, 0.0)), other.name: (0.8, 0.0), own.name: (0.0, 0.6)}
+    rig = Rig(boxes.size_px, dict.fromkeys(names, np.eye(3)), baselines, nothing, nothing, ("distance",), (), nothing)
+    off = 0.1  # across the baseline by the rig
+    parallax, std_px = _parallax_by_rig(own, [(other, Parallax(relief, (0.8, off)))], rig)
+    assert parallax.baseline == pytest.approx((0.0, 0.6))
+    assert std_px == pytest.approx(np.sqrt(2 * off**2 * (2 + (0.6 / 0.8) ** 2)) * relief.rms_px)
 
 
 @pytest.mark.full
