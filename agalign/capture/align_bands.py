@@ -217,7 +217,11 @@ class CaptureEstimation:
             band.candidates += [] if by_windows is None else [by_windows]
 
     def _add_errors_of_relief(self) -> None:
-        """Add the relief that homographies lack to their errors, where no window is near."""
+        """Add the relief that homographies lack to their errors, where no window is near.
+
+        Bands that pass without it keep their errors: with it, those of flat fields would be 0.3 to 0.45 px where the
+        true ones are 0.1 px.
+        """
         if not self._may_be_homography:
             return
         known = {b.pair.name: b.joint.fixed_to_moving for b in self.refined if b.joint.is_retrieved}

@@ -79,14 +79,14 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     warped = WarpedPair.of(pair, mapping, windows)
     if warped.alias_peak().ratio > MAX_ALIAS_PEAK:
         return None
-    error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, mapping.field, relief_std_px=0.0)
+    error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, mapping.field)
     evidence = warped.residual, band.joint, warped
     return Candidate(pair, mapping, error, *evidence, inherited_issues=band.rejected)
 
 
 def _is_consistent(fit: WindowFit) -> bool:
     """Return True if the windows of a coarse band, which overlap by half, agree with their fit."""
-    min_windows = 16  # twice the parameters of a homography
+    min_windows = 16  # twice the eight parameters of a homography; the lens shapes have a prior
     # Px of the reduced reference, 1.5 px of the band. By chance, one in a hundred windows of at least 56 px is closer.
     max_close_px, min_close_share = 3.0, 0.85
     count = len(fit.residuals_px)

@@ -64,7 +64,7 @@ class Candidate:
         if self.inherited_issues:
             return self.inherited_issues
         pixel_px = self.pair.file_pixel_size_px
-        found = issues_of(self.mapping, self.error, self.residual, self.joint, self.checked_px, pixel_px)
+        found = issues_of(self.mapping, self.error, self.residual, self.joint, self.common_px, pixel_px)
         found = found or self._issues_of_pixels
         issues = tuple(issue for issue in found if issue.kind not in self.ignored)
         if issues or self.other_residual is None:
@@ -109,13 +109,6 @@ class Candidate:
             return self.refined_from.common_px
         return points_in_frame(self.mapping, *self.pair.sizes_px)
 
-    @property
-    def checked_px(self) -> Points:
-        """Points (n, 2) whose errors are limited: those of the windows under a relief, whose error at a pixel without
-        texture no image shows; without one, the error is smooth, and the whole common area counts.
-        """
-        return self.common_px if self.mapping.parallax is None else self.residual.centres_px
-
 
 def mapping_error(
     pair: BandPair,
@@ -123,13 +116,11 @@ def mapping_error(
     covariance_px2: NDArray[np.float64],
     residual: Residual,
     lens_field: DisplacementField | None = None,
-    *,
-    relief_std_px: float | None = None,
 ) -> MappingError:
     """Return the error of a mapping that was estimated on the images of a pair.
 
-    Unknown lens shapes are part of it, unless the covariance (12, 12) contains them, and so is the relief that a
-    mapping without one lacks: by default that of the flight. The displacement field beyond that of the lenses,
+    Unknown lens shapes are part of it, unless the covariance (12, 12) contains them, and so is the relief of the flight
+    if the mapping has none. The displacement field beyond that of the lenses,
     `lens_field`, by default that of the rig, continues by chance where no window is near.
     """
     spread_px, lens_field = 0.0, pair.field if lens_field is None else lens_field
@@ -144,9 +135,7 @@ def mapping_error(
         residual,
         lens_std_px=pair.unknown_lens_std_px if len(covariance_px2) == 8 else None,
         field_std_px=spread_px,
-        relief_std_px=(
-            0.0 if mapping.parallax is not None else pair.relief_std_px if relief_std_px is None else relief_std_px
-        ),
+        relief_std_px=0.0 if mapping.parallax is not None else pair.relief_std_px,
         parallax=mapping.parallax,
     )
 

@@ -35,7 +35,8 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 
 
 def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) -> Candidate | Issue | None:
-    """Return the candidate of a band that is fitted to tiles of the files, from one by the reduced images.
+    """Return the candidate of a band that is fitted to tiles of the files, from one by the reduced images, whose
+    displacement field it has: windows of those images have verified it.
 
     None if the tiles have too little structure, or if the shifts of held-out windows do not decrease. The issue
     UNREADABLE if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
@@ -58,7 +59,8 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     joint = start.joint.with_homography(down.fixed_to_moving, fitted.fit.covariance_px2 * np.outer(factors, factors))
     held_out = fitted.held_out.rescaled(scale)
     error = mapping_error(pair, down, joint.covariance_px2, held_out)
-    return Candidate(pair, down, error, held_out, joint, refined_from=start)
+    refined = Candidate(pair, down, error, held_out, joint, refined_from=start)
+    return refined.with_relief_std_px(start.error.relief_std_px)
 
 
 def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:

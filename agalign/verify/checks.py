@@ -43,8 +43,8 @@ MAX_ALIAS_PEAK = 0.75
 _MIN_COMMON_COVERAGE = 0.3
 """Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
-"""`aligned` means an expected error of at most this in this share of the common area; under a relief, at this share of
-the windows. If the RMS error is 0.5 px, 2 % of the pixels are off by more than 1 px."""
+"""`aligned` means an expected error of at most this in this share of the common area; that of a relief counts at the
+windows. If the RMS error is 0.5 px, 2 % of the pixels are off by more than 1 px."""
 MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
 _MAX_NOISE_STD = 2.0
@@ -69,20 +69,20 @@ def issues_of(
     error: MappingError,
     residual: Residual,
     joint: JointResult | None,
-    checked_px: Points,
+    common_px: Points,
     pixel_px: float = 1.0,
 ) -> tuple[Issue, ...]:
     """Return every reason for not accepting a mapping of a reference, without its pixels; empty if it passes.
 
     The first issue is the reason in the sidecar. `residual` is measured with the mapping, `joint` is the evidence of
-    descriptors, and `checked_px` (n, 2) are the points whose errors are limited. `pixel_px` is the size of a pixel of
-    the reference's file on this grid: limits of shifts and errors are in px of the file.
+    descriptors, and `common_px` (n, 2) are points of the whole area that the moving image covers. `pixel_px` is the
+    size of a pixel of the reference's file on this grid: limits of shifts and errors are in px of the file.
     """
     return (
         *_mapping_issues(mapping.fixed_to_moving, error.size_px),
         *_descriptor_issues(joint, residual),
         *_window_issues(residual, pixel_px),
-        *_error_issues(error, residual, checked_px, pixel_px),
+        *_error_issues(error, residual, common_px, pixel_px),
     )
 
 
@@ -134,15 +134,19 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
     return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
 
 
-def _error_issues(error: MappingError, residual: Residual, checked_px: Points, pixel_px: float) -> Iterator[Issue]:
+def _error_issues(error: MappingError, residual: Residual, common_px: Points, pixel_px: float) -> Iterator[Issue]:
     """Check the expected error over the common area.
 
-    A relief comes from other bands, so its error is small even where this band shows a different scene. Under a relief,
-    the error is therefore checked at the windows, and the band must have a measured shift in them.
+    No image shows the error of a relief at a pixel without texture. Under a relief, the smooth part of the error is
+    checked over the area, and all of it at the windows. A relief comes from other bands, so its error is small even
+    where this band shows a different scene: the band must have a measured shift in the windows.
     """
-    if not len(checked_px):
+    if not len(common_px):
         return
-    share = float((error.error_px(checked_px) <= _MAX_ERROR_PX * pixel_px).mean())
+    errors_px = [np.sqrt(np.sum(error.smooth_px2(common_px), axis=0))]
+    if error.parallax is not None and len(residual.centres_px):
+        errors_px.append(error.error_px(residual.centres_px))
+    share = min(float((px <= _MAX_ERROR_PX * pixel_px).mean()) for px in errors_px)
     if not share >= _MIN_ACCURATE_SHARE:
         yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
     if error.parallax is not None and not residual.coverage >= _MIN_ACCURATE_SHARE:

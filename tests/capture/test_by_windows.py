@@ -264,6 +264,12 @@ def test_a_coarse_band_without_any_candidate_is_not_verified_by_the_windows_of_i
     assert by_windows.issues == (Issue(OTHER_GEOMETRY),)
 
 
+def test_a_coarse_band_has_the_error_of_the_relief_of_its_flight(scene: np.ndarray) -> None:
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
+    over_trees = replace(band.pair, relief_std_px=3.0)
+    assert module.agreeing_with_seed(BandCandidates(over_trees, band.seed)).error.relief_std_px == 3.0
+
+
 def test_areas_without_data_do_not_count_in_a_georeferenced_coarse_band(scene: np.ndarray) -> None:
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
     reference = band.pair.reference.image

@@ -10,6 +10,7 @@ import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry, issues
 from agalign.values.alignment import JointResult, Prediction
+from agalign.values.geometry import Points
 from agalign.values.issues import Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
@@ -43,12 +44,13 @@ RESIDUAL = measured_in(1.0)
 
 @dataclass(frozen=True)
 class Checked:
-    """A mapping whose error is limited at its windows, and its evidence."""
+    """A mapping whose error is limited in the common area, by default at its windows, and its evidence."""
 
     joint: JointResult | None = JOINT
     windows: Residual = RESIDUAL
     parallax: Parallax | None = None
     pixel_px: float = 1.0
+    common_px: Points | None = None
 
     @property
     def issues(self) -> tuple[Issue, ...]:
@@ -56,10 +58,12 @@ class Checked:
         mapping = PixelMapping(np.eye(3) if joint is None else joint.fixed_to_moving).with_parallax(self.parallax)
         covariance_px2 = None if joint is None else joint.covariance_px2
         error = MappingError(SIZE, covariance_px2, self.windows, parallax=self.parallax)
-        return issues_of(mapping, error, self.windows, joint, self.windows.centres_px, self.pixel_px)
+        common_px = self.windows.centres_px if self.common_px is None else self.common_px
+        return issues_of(mapping, error, self.windows, joint, common_px, self.pixel_px)
 
 
 GOOD = Checked()
+FLAT = Parallax(Relief(np.zeros((SIZE[1], SIZE[0]), np.float32), np.ones((SIZE[1], SIZE[0]), np.float32)), (1.0, 0.0))
 STRETCHED = np.array([[1.0, 0, 0], [0, 1, 0], [-5e-4, 0, 1]])
 NAN = float("nan")
 
@@ -92,11 +96,19 @@ def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
 
 
 def test_a_part_of_the_image_that_the_relief_of_other_bands_does_not_align_is_an_issue() -> None:
-    flat = Relief(np.zeros((SIZE[1], SIZE[0]), np.float32), np.ones((SIZE[1], SIZE[0]), np.float32))
-    under_relief = Checked(parallax=Parallax(flat, (1.0, 0.0)))
+    under_relief = Checked(parallax=FLAT)
     assert codes(under_relief, measured_in(0.9)) == []
     assert codes(under_relief, measured_in(0.89)) == ["unmeasured"]
     assert codes(GOOD, measured_in(0.89)) == []
+
+
+def test_windows_in_one_corner_do_not_verify_a_mapping_under_a_relief_elsewhere() -> None:
+    corner = residual_of(grid_px(np.arange(0, 240, 40), np.arange(0, 240, 40)), np.zeros((36, 2)))
+    checked = Checked(joint_result(std_px=0.2), corner, FLAT)
+    assert checked.issues == ()
+    (issue,) = replace(checked, common_px=grid_px(np.arange(0, 1280, 80), np.arange(0, 960, 80))).issues
+    assert (issue.code, issue.detail) == ("inaccurate", "0.5 px")
+    assert issue.value > 0.5
 
 
 def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
