@@ -88,8 +88,8 @@ def align(
     -------
     Alignment
         The mapping from pixels of `fixed` to pixels of `moving` (x right, y down, (0, 0) the centre of the top-left
-        pixel), its standard error and its `status`. Only `aligned` has passed verification. With `predicted`, the
-        mapping is extrapolated over a part of the image, with the standard error `prediction.std_px`. With `seed_only`
+        pixel), its expected error and its `status`. Only `aligned` has passed verification. With `predicted`, the
+        mapping is extrapolated over a part of the image, with the expected error `prediction.std_px`. With `seed_only`
         and `failed` it is the initial alignment; `reason` explains why. examples/two_arrays.py saves it as JSON.
 
     Raises

@@ -55,7 +55,7 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
             error = ""
             if part.status == "predicted" and part.error is not None:
                 limit_px = sidecar.accept_predicted_px
-                error = f" with a standard error of {part.error.in_words}, above {limit_px:g} px of the band"
+                error = f" with an expected error of {part.error.in_words}, above {limit_px:g} px of the band"
             problem = f"{part.band} is {part.status.replace('_', ' ')}{error} ({part.reason})"
         result.append(AlignedBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result

@@ -183,7 +183,7 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
         remedy = remedy_of(band, is_mosaic=sidecar.reference.georeferenced)
         if band.status == "predicted" and band.prediction is not None:
             if band.error is not None:
-                size, size_text = band.error.std_px, f"standard error up to {band.error.in_words}"
+                size, size_text = band.error.std_px, f"expected error up to {band.error.in_words}"
             if band.is_usable(sidecar.accept_predicted_px):
                 lost = max(over_1_px, _UNVERIFIED_PIXELS if remedy is remedies.BLURRED else 0.0)
         reason = band.reason or ""

@@ -234,14 +234,14 @@ class ErrorPart(_Part):
 
     @property
     def in_words(self) -> str:
-        """The standard error, in px of the band too if its pixels differ from those of the reference."""
+        """The expected error, in px of the band too if its pixels differ from those of the reference."""
         if self.std_band_px is None:
             return f"{self.std_px:.2f} px of the reference"
         return in_both_px(self.std_px, self.std_band_px)
 
     @property
     def other_px(self) -> float | None:
-        """The standard error in px of the band, if these differ from those of the reference; else None."""
+        """The expected error in px of the band, if these differ from those of the reference; else None."""
         if self.std_band_px is None or has_same_pixel_size(self.std_px, self.std_band_px):
             return None
         return self.std_band_px
@@ -392,7 +392,7 @@ class BandResult(_Part):
         )
 
     def is_usable(self, accept_predicted_px: float) -> bool:
-        """Return True for the reference, an aligned band, or a predicted band with an accepted standard error."""
+        """Return True for the reference, an aligned band, or a predicted band with an accepted expected error."""
         return is_usable(self.status, self.prediction, accept_predicted_px)
 
     def without_tables(self) -> Self:

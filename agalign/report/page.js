@@ -1225,7 +1225,7 @@ function sentence(pair, capture) {
   if (pair.status === "predicted") {
     const use = pair.usable ? "indices can use it, but its own image does not confirm it" : "not suitable for indices";
     const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
-    return `${offset}${how}, standard error ${fixed(pair.error_px)} px of the reference${inBandPx(pair)}; ${use}: ${pair.reason ?? "no reason was recorded"}.${over}`;
+    return `${offset}${how}, expected error ${fixed(pair.error_px)} px of the reference${inBandPx(pair)}; ${use}: ${pair.reason ?? "no reason was recorded"}.${over}`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason was recorded"}. Only its seed is applied; exclude it from indices.`;
   return `failed: ${pair.reason ?? "no reason was recorded"}. It is nodata in the output.`;

@@ -57,7 +57,7 @@ class CautionGroup:
         """The remedy; for predicted bands, also when they may be used as they are."""
         if self.status != "predicted":
             return self.remedy.advice
-        usable = "indices use those with a standard error (prediction.std_px, px of the band) within --accept-predicted"
+        usable = "indices use those with an expected error (prediction.std_px, px of the band) up to --accept-predicted"
         return f"{usable}; {self.remedy.advice}"
 
     @property
@@ -105,7 +105,7 @@ class PairTotals:
     run: RunFacts = field(default_factory=RunFacts)
     bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
     usable: Counter[str] = field(default_factory=Counter)
-    """Number of moving bands that indices can use by status: aligned, or predicted within the accepted standard error.
+    """Number of moving bands that indices can use by status: aligned, or predicted with an accepted expected error.
     """
     _cautions: list[Caution] = field(default_factory=list)
     _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)

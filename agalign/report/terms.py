@@ -24,8 +24,8 @@ TERMS: dict[str, Term] = {
     "predicted": Term(
         "predicted",
         "band: its image does not determine the whole mapping (water, blur, parallax seen by only two lenses). Other "
-        "bands and captures predict it, or windows in a part of the image, with a standard error. Indices use it up to "
-        "--accept-predicted, px of the band",
+        "bands and captures predict it, or windows in a part of the image, with an expected error. Indices use it up "
+        "to --accept-predicted, px of the band",
     ),
     "seed_only": Term(
         "seed only, failed, missing",

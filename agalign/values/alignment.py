@@ -168,7 +168,7 @@ class Prediction:
 
     Examples
     --------
-    `Alignment.prediction` is one. Indices use a predicted band if its standard error is small enough:
+    `Alignment.prediction` is one. Indices use a predicted band if its expected error is small enough:
 
     >>> prediction = agalign.Prediction(np.eye(3), "neighbours", std_px=0.42, off_px=0.3)
     >>> prediction.std_px <= agalign.CheckSettings().accept_predicted_px
@@ -224,7 +224,7 @@ class Alignment:
     seed: Seed
     """The initial alignment."""
     joint: JointResult | None = None
-    """The band's own estimate with its standard error; None without one."""
+    """The band's own estimate with its expected error; None without one."""
     residual: Residual | None = None
     """Shifts of windows, each under a mapping that was estimated without the window; of all windows under a seed or a
     prediction of the rig."""
@@ -255,7 +255,7 @@ class Alignment:
 
         =========  ===================================================
         aligned    there are no issues: it passed verification
-        predicted  the mapping is a prediction with a standard error
+        predicted  the mapping is a prediction with an expected error
         seed_only  the mapping is that of the seed, which is usable
         failed     otherwise; the mapping is that of the seed
         =========  ===================================================
@@ -268,7 +268,7 @@ class Alignment:
 
     @property
     def std_band_px(self) -> float:
-        """The standard error in px of the moving image: for a thermal band, whose pixels are larger than those of the
+        """The expected error in px of the moving image: for a thermal band, whose pixels are larger than those of the
         reference, a smaller number than `std_px`. `prediction.std_px` of a predicted band.
         """
         if self.status == "predicted" and self.prediction is not None:
@@ -465,12 +465,12 @@ class Alignment:
         return ErrorOnGrid.of(self.error, self.size_px).on_tile(Tile(0, 0, *self.size_px))
 
     def is_usable(self, accept_predicted_px: float) -> bool:
-        """Return True if the band is aligned, or predicted with a small standard error.
+        """Return True if the band is aligned, or predicted with a small expected error.
 
         Parameters
         ----------
         accept_predicted_px
-            Largest standard error of a prediction, px of the band, such as `CheckSettings.accept_predicted_px`.
+            Largest expected error of a prediction, px of the band, such as `CheckSettings.accept_predicted_px`.
 
         Returns
         -------
@@ -522,7 +522,7 @@ class Alignment:
                 "windows": "windows in the image",
             }
             error = in_both_px(self.std_px, self.std_band_px)
-            return f"{text}; predicted from {sources[self.prediction.source]}, standard error {error}"
+            return f"{text}; predicted from {sources[self.prediction.source]}, expected error {error}"
         if self.status == "seed_only":
             return f"{text}; the {self.seed.kind} seed is used unchanged"
         if self.issues[-1].kind == SEED_DOES_NOT_FIT:
@@ -538,7 +538,7 @@ class Alignment:
 
 
 def is_usable(status: PairStatus, prediction: Prediction | None, accept_predicted_px: float) -> bool:
-    """Return True for the reference, an aligned band, or a predicted one with a standard error of at most
+    """Return True for the reference, an aligned band, or a predicted one with an expected error of at most
     `accept_predicted_px`, px of the band: the one definition of a delivered band.
 
     The limit also holds in px of the coarser of band and reference, which is what their combination resolves: a band

@@ -312,7 +312,7 @@ def test_captures_that_are_ok_by_prediction_have_their_own_colour(browser: Any, 
     assert page.locator("#table tbody tr").last.locator("td").nth(2).inner_text() == "13.290 (0.93 px of the band)"
     look_at(page, "b")
     text = page.locator("#capture").inner_text()
-    assert "standard error 13.29 px of the reference (0.93 px of the band); indices can use it" in text
+    assert "expected error 13.29 px of the reference (0.93 px of the band); indices can use it" in text
     for width in (375, 1000):
         page.set_viewport_size({"width": width, "height": 800})
         assert page.locator(".scroll:has(#table)").evaluate("e => e.scrollWidth <= e.clientWidth"), "it is not cut off"

@@ -285,7 +285,7 @@ def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float,
     ("status", "accepted_px", "std_px", "problem"),
     [
         ("predicted", 2.0, 1.5, ""),
-        ("predicted", 0.5, 0.8, "NIR is predicted with a standard error of 0.80 px, above 0.5 px of the band"),
+        ("predicted", 0.5, 0.8, "NIR is predicted with an expected error of 0.80 px, above 0.5 px of the band"),
         ("predicted", 0.5, 0.4, ""),
         ("seed_only", 0.5, 0.4, "NIR is seed only"),
     ],

@@ -84,14 +84,14 @@ def test_a_good_band_needs_no_check() -> None:
         ({"saturated": 0.125}, "12.5% of the pixels are saturated", 0.125, "up to 12.5% of a band"),
         ({"prediction": prediction(0.1, 7.42)}, "its own image is aligned 7.4 px of", 0.5, "up to 7.4 px of the band"),
         ({"status": "failed", "reason": "it is blank", "issues": issue("coverage")}, "it is blank", 1.0, ""),
-        (predicted(0.02, "retrieval", reason="dim"), "dim", 0.5, "standard error up to 0.02 px"),
-        (predicted(0.4, "cluster", share_over_1_px=0.125), "", 0.125, "standard error up to 0.40 px"),
-        (predicted(4.0, "cluster"), "", 1.0, "standard error up to 4.00 px"),
+        (predicted(0.02, "retrieval", reason="dim"), "dim", 0.5, "expected error up to 0.02 px"),
+        (predicted(0.4, "cluster", share_over_1_px=0.125), "", 0.125, "expected error up to 0.40 px"),
+        (predicted(4.0, "cluster"), "", 1.0, "expected error up to 4.00 px"),
         (
             predicted(0.88, "coverage", error={"std_px": 12.55, "std_band_px": 0.88}),
             "",
             0.0,
-            "standard error up to 12.55 px of the reference (0.88 px of the band)",
+            "expected error up to 12.55 px of the reference (0.88 px of the band)",
         ),
     ],
 )
@@ -224,12 +224,12 @@ def test_console_and_log_print_the_list(capsys: pytest.CaptureFixture[str]) -> N
         "agalign: IMG_3: no result: the run has no result of the capture",
         "    try: the same command resumes the run",
     ]
-    assert "blur or noise in one of the bands (standard error up to 0.02 px)" in printed
+    assert "blur or noise in one of the bands (expected error up to 0.02 px)" in printed
     explain(groups(), Terminal(log_json=True))
     lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert [(e["status"], e["size"]) for e in lines[1:]] == [
         ("no_result", ""),
-        ("predicted", "standard error up to 0.02 px"),
+        ("predicted", "expected error up to 0.02 px"),
         ("failed", ""),
         ("check", "reflectance is uncertain by up to 10%"),
     ]
@@ -259,7 +259,7 @@ def test_report_and_tables_have_what_to_check(tmp_path: Path) -> None:
     assert checks == {("IMG_0001", "Red edge"): reason}
     page = (tmp_path / "index.html").read_text()
     assert page.index("Check these") < page.index("By band")
-    assert "standard error up to 0.02 px" in page
+    assert "expected error up to 0.02 px" in page
 
 
 def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:

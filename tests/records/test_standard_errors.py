@@ -205,9 +205,9 @@ def test_an_error_has_its_value_in_both_pixels_and_the_limit_holds_in_the_coarse
     if status == "ok":
         assert min(part.error.std_px, part.error.std_band_px) <= 1
     assert (part.error.std_px, part.error.std_band_px) == pytest.approx((std_px, std_band_px))
-    assert part.reason.endswith(f"standard error {words}")
+    assert part.reason.endswith(f"expected error {words}")
     problem = bands_of(sidecar, Path())[1].problem
-    stated = f"Other is predicted with a standard error of {words}, above 1 px of the band ("
+    stated = f"Other is predicted with an expected error of {words}, above 1 px of the band ("
     assert problem.startswith(stated if status == "degraded" else "the pixels of Other were not written")
     assert (part.error.other_px is None) == ("reference" not in words)
     earlier = part.error.model_copy(update={"std_band_px": None})

@@ -582,9 +582,9 @@ def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
     assert [b.capture for b in groups[-1].bands] == ["one", "two"]
     assert groups[-1].captures == 2
     assert groups[-1].advice.startswith(
-        "indices use those with a standard error (prediction.std_px, px of the band) within --accept-predicted"
+        "indices use those with an expected error (prediction.std_px, px of the band) up to --accept-predicted"
     )
-    assert groups[-1].size == "standard error up to 0.10 px"
+    assert groups[-1].size == "expected error up to 0.10 px"
     assert "card" in groups[0].advice
     assert result.statuses == {"aligned": 1, "predicted": 2, "failed": 1, "missing": 1, "seed_only": 2}
     assert {name: dict(band.statuses) for name, band in result.bands.items()} == {
