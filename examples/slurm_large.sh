@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# One large flight on a SLURM cluster: a Dask scheduler and 64 workers. If the time limit ends it, submit it again to
-# resume. Tested with two workers, without SLURM.
+# One large flight on a SLURM cluster: a Dask scheduler and 64 workers, on any number of nodes (`sbatch --nodes=4 …` for
+# four). If the time limit ends it, submit it again to resume. SLURM shows exit code 3, "check the results", as FAILED.
+# Tested with two workers, without SLURM.
 #
 #     FLIGHT=/data/flight OUT=/data/aligned sbatch examples/slurm_large.sh
 #

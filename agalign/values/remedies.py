@@ -73,7 +73,8 @@ PARALLAX = Remedy(
 NO_RESULT = Remedy("the run has no result of the capture", "the same command resumes the run")
 BLURRED = Remedy(
     TEXTURELESS.cause,
-    "look at the picture: a blurred or noisy band gives wrong indices at every edge, wherever it is; --bands omits it",
+    "look at the picture: a blurred or noisy band gives wrong indices at every edge, wherever it is; "
+    "--accept-predicted 0 leaves predicted bands out of indices",
 )
 """For a band that is predicted already: its position is known, its pixels are not verified."""
 INACCURATE = Remedy(
