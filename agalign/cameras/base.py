@@ -25,7 +25,7 @@ from agalign.values.band_names import own_stem
 from agalign.values.capture import Band, CaptureTime, Pose, Position
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
-from agalign.values.spectrum import band_key
+from agalign.values.spectrum import ROLES, band_key
 
 
 class Camera(ABC):
@@ -124,7 +124,7 @@ def default_reference(bands: Sequence[Band]) -> int:
     """
     reflective = [i for i, b in enumerate(bands) if not is_thermal(b)]
     for index in reflective:
-        if re.split(r"[-_ ]", bands[index].name.lower())[0] in ("green", "gre", "g"):
+        if re.split(r"[-_ ]", bands[index].name.lower())[0] in ROLES["green"].names:
             return index
     green_nm = 550.0
     known = [(abs(nm - green_nm), i) for i in reflective if (nm := bands[i].wavelength_nm) is not None]

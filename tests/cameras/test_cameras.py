@@ -88,6 +88,7 @@ def test_default_reference() -> None:
         return Band(name, Path("x"), 1, 1, 1, "uint8", wavelength_nm=wavelength)
 
     assert default_reference([band("Blue"), band("Green-560"), band("NIR")]) == 1
+    assert default_reference([band("BLU"), band("GRN"), band("NIR")]) == 1
     assert default_reference([band("band_1", 840), band("band_2", 560), band("band_3", 475)]) == 1
     assert default_reference([band("LWIR", 11000), band("Red", 668)]) == 1
     assert default_reference([band("a"), band("b")]) == 0
