@@ -54,8 +54,8 @@ class Caution:
     reason: str
     """What was measured, in words."""
     lost: float
-    """Share of the values of the band, 0 to 1, that are missing, displaced or wrong: a reflectance that is wrong by
-    40 % counts as 0.4.
+    """Values that are missing, displaced or wrong, in units of those of one band of one capture: a reflectance that is
+    wrong by 40 % counts as 0.4, a capture as the number of its bands.
     """
     size: float = -math.inf
     size_text: str = ""

@@ -63,8 +63,8 @@ class FlightFacts:
         """(label, reason) of the captures by requested index that was not written."""
         self.statuses: Counter[str] = Counter()
         """Number of captures by status as the page shows it: `ok_by_prediction` is not `ok`."""
-        self.cameras: dict[str, CameraOffsets] = {}
-        """By name."""
+        self.cameras: dict[tuple[str, str], CameraOffsets] = {}
+        """By name of the model, and unit."""
         self.seconds: dict[str, float] = {}
         """Processing time of each capture, by label."""
         self.placed = 0
@@ -98,14 +98,14 @@ class FlightFacts:
         for name, status, reason in sidecar.pairs:
             if status == "missing":
                 self._summary.add(keys | {"band": name, "status": status, "reason": reason, "check": reason})
-        self._count(facts)
+        self._count(facts, sidecar.camera.unit)
         if self._rows.add(_map_row(facts)):
             self._rows.flush()
         if self._details.add(facts):
             self._flush_details()
 
-    def _count(self, facts: dict[str, Any]) -> None:
-        label, camera = facts["label"], self.cameras.setdefault(facts["camera"], CameraOffsets())
+    def _count(self, facts: dict[str, Any], unit: str) -> None:
+        label, camera = facts["label"], self.cameras.setdefault((facts["camera"], unit), CameraOffsets())
         self.statuses[facts["shown"]] += 1
         self.seconds[label] = facts["seconds"]
         self.placed += facts["position"] is not None

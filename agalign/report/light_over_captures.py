@@ -101,8 +101,7 @@ class LightOverCaptures:
     _corners: dict[tuple[str, str], list[float]] = field(default_factory=lambda: defaultdict(list))
     """Logarithms of the ratios of corners to middle, by camera and band."""
     _recent: dict[str, deque[_CaptureCells]] = field(default_factory=lambda: defaultdict(lambda: deque(maxlen=_RECENT)))
-    _last: str = ""
-    """Label of the last capture."""
+    """The last captures by camera."""
 
     def add(self, label: str, camera: str, captured_at: str, output: OutputPart | None) -> Iterator[Caution]:
         """Add a capture, and yield the bands that differ from the capture nearest in time over the same ground."""
@@ -116,18 +115,25 @@ class LightOverCaptures:
         if near:
             yield from own.jumps(min(near, key=own.apart_s))
         self._recent[camera].append(own)
-        self._last = label
 
     def uneven(self) -> Iterator[Caution]:
         """Yield the bands whose mean over many captures is not flat: scenes differ, the lens does not."""
-        for (_, band), logarithms in self._corners.items():
+        for (camera, band), logarithms in self._corners.items():
             count, mean = len(logarithms), float(np.mean(logarithms))
             std = float(np.std(logarithms)) / math.sqrt(count)
             if count >= _MIN_CAPTURES and abs(mean) > max(_MAX_UNEVEN, _MIN_UNEVEN_STD * std):
                 share = math.expm1(mean)
                 reason = f"in {count} captures, the corners are {share:+.0%} from the middle (± {std:.0%})"
                 lost = min(1.0, abs(share)) * count
-                yield Caution(band, NOT_FLAT, reason, lost, abs(share), f"up to {abs(share):.0%}", capture=self._last)
+                yield Caution(
+                    band,
+                    NOT_FLAT,
+                    reason,
+                    lost,
+                    abs(share),
+                    f"up to {abs(share):.0%}",
+                    capture=self._recent[camera][-1].label,
+                )
 
 
 def same_ground(one: Cells, other: Cells, *, is_certain: bool) -> NDArray[np.float64] | None:

@@ -129,10 +129,10 @@ class PairTotals:
                 error = part.error.std_px, part.error.other_px, label, part.band, part.share_over_1_px
                 self.bands[part.band].add_error(ExpectedError(*error))
         camera, reference = result.camera, result.reference.band
-        of_light = self._light.add(label, f"{camera.name} {camera.serial}", result.captured_at, result.output)
+        of_light = self._light.add(label, f"{camera.name} {camera.unit}", result.captured_at, result.output)
         cautions = [replace(c, capture=label) for c in (*self.run.cautions(result, label), *of_light)]
         self._cautions += cautions
-        flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
+        flight = (camera.name, camera.unit, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
         self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
         self._votes[flight].update((reference, *result.missing_bands))
         return cautions
@@ -181,10 +181,14 @@ class PairTotals:
         """Yield the captures whose reference differs from that of most captures of their flight. All their values are
         displaced from those of the others; `lost` is the number of bands of a capture.
         """
+        used: dict[tuple[str, ...], set[str]] = defaultdict(set)
+        for _, flight, band, _ in self._references:
+            used[flight].add(band)
+        # A band that all captures lack has their votes, and is the reference of none.
+        usual = {f: next(b for b, _ in votes.most_common() if b in used[f]) for f, votes in self._votes.items()}
         for label, flight, band, others in self._references:
-            usual = self._votes[flight].most_common(1)[0][0]
-            if usual in others:
-                reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
+            if usual[flight] in others:
+                reason = f"on the grid of {band}; most captures of the flight are on that of {usual[flight]}"
                 yield Caution(band, OTHER_REFERENCE, reason, lost, status="other_reference", capture=label)
 
     def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:

@@ -41,6 +41,7 @@ def add(
     seconds: float = 2.0,
     radiometry: str = "reflectance by panel",
     dark: tuple[str, ...] = (),
+    unit: str = "",
 ) -> list[Caution]:
     """The cautions about the light of a capture, one each `seconds`."""
     at = np.datetime64("2024-06-01T12:00:00.000") + np.timedelta64(int(1000 * seconds * number), "ms")
@@ -49,7 +50,8 @@ def add(
         for name, means in zip(BANDS, cells, strict=True)
     ]
     output = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan", "radiometry": radiometry, "band_radiometry": bands}
-    found = totals.add(f"IMG_{number:04d}", example(output=output, captured_at=f"{at}+00:00"))
+    camera = {"make": "DJI", "model": "FC6360", "lens_calibration": unit}
+    found = totals.add(f"IMG_{number:04d}", example(output=output, captured_at=f"{at}+00:00", camera=camera))
     return [caution for caution in found if caution.remedy is JUMP]
 
 
@@ -99,6 +101,23 @@ def test_captures_that_end_in_another_order_are_compared_with_the_nearest_in_tim
     assert found == [(4, band) for band in BANDS]
 
 
+def darker_corners(ratio: float) -> Image:
+    """The cells of a flat field whose corners are darker in NIR by a ratio to the middle."""
+    y, x = np.mgrid[-1 : 1 : ROWS * 1j, -1 : 1 : COLUMNS * 1j]
+    r = np.hypot(3 * y, 4 * x) / 5
+    falloff = 1 + (ratio - 1) * np.clip((r - 0.4) / 0.35, 0, 1)
+    return np.asarray(0.2 * np.stack([np.ones_like(r), np.ones_like(r), falloff]))
+
+
+def test_two_cameras_of_a_model_are_told_apart() -> None:
+    totals = PairTotals()
+    for k in range(50):
+        add(totals, k, darker_corners(0.75 if k < 25 else 1.0), unit="first" if k < 25 else "second")
+    (group,) = (g for g in totals.groups() if g.remedy is NOT_FLAT)
+    assert [(b.band, b.capture) for b in group.bands] == [("NIR", "IMG_0024")]
+    assert "in 25 captures, the corners are -25%" in group.bands[0].reason
+
+
 @pytest.mark.parametrize(
     ("mean", "captures", "is_named"), [(0.75, 25, True), (0.75, 10, False), (0.97, 25, False), (1.4, 25, True)]
 )
@@ -107,11 +126,8 @@ def test_the_mean_of_many_captures_shows_whether_the_vignetting_is_corrected(
     radiometry: str, mean: float, captures: int, is_named: bool
 ) -> None:
     totals, rng = PairTotals(), np.random.default_rng(0)
-    y, x = np.mgrid[-1 : 1 : ROWS * 1j, -1 : 1 : COLUMNS * 1j]
-    r = np.hypot(3 * y, 4 * x) / 5
     for k in range(captures):
-        falloff = 1 + (mean * np.exp(rng.normal(0.0, 0.15)) - 1) * np.clip((r - 0.4) / 0.35, 0, 1)
-        add(totals, k, 0.2 * np.stack([np.ones_like(r), np.ones_like(r), falloff]), radiometry=radiometry)
+        add(totals, k, darker_corners(mean * np.exp(rng.normal(0.0, 0.15))), radiometry=radiometry)
     groups = [g for g in totals.groups() if g.remedy is NOT_FLAT]
     assert bool(groups) == is_named
     if is_named:

@@ -474,7 +474,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     labels = [(f"2026-06-21T10:00:{i:02d}", f"{i:02d}") for i in range(7)]
     # In the order of time, whatever that of the captures is.
     known = CameraOffsets(labels[::-1], offsets[::-1])
-    (drift,) = drifts_of({"camera": known})
+    (drift,) = drifts_of({("camera", ""): known})
     assert drift["ends"] == ("00", "06")
     assert drift["full_px"] == pytest.approx(15, abs=0.01)
     assert [len(line["points"]) for line in drift["lines"]] == [2, 1]
@@ -483,7 +483,9 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
     # Along the same baseline in the other direction, a band is drawn next to the first, not opposite to it.
     assert np.sign(np.diff(heights[0])).tolist() == np.sign(np.diff(heights[1][:3] + heights[1][4:])).tolist()
-    assert drifts_of({"camera": CameraOffsets(labels[:2], offsets[:2])}) == []
+    assert drifts_of({("camera", ""): CameraOffsets(labels[:2], offsets[:2])}) == []
+    titles = [chart["title"] for chart in drifts_of({("A", "1"): known, ("A", "2"): known, ("B", "3"): known})]
+    assert titles == [f"{camera} from capture to capture" for camera in ("A 1", "A 2", "B")]
 
 
 @pytest.mark.slow
@@ -626,6 +628,16 @@ def test_captures_with_another_reference_than_most_of_their_flight_are_named(ref
             groups[0].bands[0].reason
             == f"on the grid of {names[odd[0]]}; most captures of the flight are on that of {usual}"
         )
+
+
+def test_a_band_that_all_captures_lack_is_the_usual_reference_of_none() -> None:
+    result = PairTotals()
+    result.add("IMG_0", with_reference("Blue", ("Red", "Green")))
+    for number in range(1, 8):
+        result.add(f"IMG_{number}", with_reference("Green", ("Red",)))
+    (group,) = (g for g in result.groups() if g.status == "other_reference")
+    assert [b.capture for b in group.bands] == ["IMG_0"]
+    assert group.bands[0].reason == "on the grid of Blue; most captures of the flight are on that of Green"
 
 
 def test_a_run_from_python_that_is_stopped_writes_its_pages(flight: Path, tmp_path: Path) -> None:
