@@ -358,7 +358,7 @@ class _FlightRun:
 
         Raises OutputError.
         """
-        is_kept, pairs = record.captures.keys() <= {"found", "kept"}, None
+        is_kept, pairs = record.captures.keys() <= {"found", "kept", "panel", "sky"}, None
         if not is_kept or (earlier is not None and not record.has_same_results(earlier)):
             outdate_pages(self.out)
         try:

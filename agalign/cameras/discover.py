@@ -49,7 +49,7 @@ class FolderScan:
 
     @property
     def is_complete(self) -> bool:
-        """False if a file or capture is skipped that is not an exact copy of another."""
+        """False if a file or capture is skipped that may be an image of the flight, or cannot be read."""
         return all(p.is_harmless for p in self.problems)
 
     @property

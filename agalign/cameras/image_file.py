@@ -32,8 +32,8 @@ class Problem:
     error: AgalignError
     """The reason."""
     is_harmless: bool = False
-    """True for a file with the same bytes, or the same capture id, name and size, as another one, which takes part, and
-    for a file used with fewer tags."""
+    """True if the flight lacks no image by it: a copy of a file that takes part, a mask, a thumbnail, a result of
+    agalign, or a file used with fewer tags."""
 
     @property
     def text(self) -> str:

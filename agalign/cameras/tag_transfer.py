@@ -19,8 +19,9 @@ from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band, is_clock_set
 from agalign.values.image import OutputGrid
 
-_CAPTURE_TAGS: set[int] = {Base.Make, Base.Model, Base.DateTime, Base.Copyright, Base.CameraSerialNumber}
+_CAPTURE_TAGS: set[int] = {Base.Make, Base.Model, Base.Copyright, Base.CameraSerialNumber}
 """Tags of the first directory that are the same for all bands of a capture."""
+_TIMES = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
 _GEOMETRIC_EXIF: set[int] = {
     Base.FocalPlaneXResolution,
     Base.FocalPlaneYResolution,
@@ -55,12 +56,13 @@ TransferredTags = tuple[Directory, Directory, Directory]
 
 
 def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
-    """Return the tags for a stack: those that apply to all bands of a capture, whose exposures differ."""
+    """Return the tags for a stack: those that apply to all bands of a capture, whose exposures differ. Its DateTime is
+    that of the capture, which it has already.
+    """
     source = _directories(reference)
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
-    times = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
-    exif = _some(source[EXIF], times | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
-    return _without_unset_clock(first), _on_grid(exif, source[EXIF], grid), source[GPS]
+    exif = _some(source[EXIF], _TIMES | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
+    return first, _on_grid(_without_unset_clock(exif), source[EXIF], grid), source[GPS]
 
 
 def band_tags(
@@ -74,7 +76,7 @@ def band_tags(
     own, of_reference = _directories(source), _directories(reference)
     black_level: set[int] = set() if radiometry else {Base.BlackLevelRepeatDim, Base.BlackLevel}
     of_file = {Base.ImageDescription, Base.Software, Base.Artist, Base.OriginalRawFileName}
-    first = _some(own[0], _CAPTURE_TAGS | black_level | of_file) | _some(of_reference[0], {Base.Orientation})
+    first = _some(own[0], _CAPTURE_TAGS | _TIMES | black_level | of_file) | _some(of_reference[0], {Base.Orientation})
     with_offsets = {Base.MakerNote, Base.ExifInteroperabilityOffset}  # these refer to the old file
     exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in with_offsets | _GEOMETRIC_EXIF}
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
@@ -85,14 +87,16 @@ def band_tags(
         _put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = tiff_directory.byte_string(serialised)
-    return _without_unset_clock(first), _on_grid(exif, of_reference[EXIF], grid), own[GPS]
+    exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], grid)
+    return _without_unset_clock(first), exif, own[GPS]
 
 
-def _without_unset_clock(first: Directory) -> Directory:
-    """The first directory without the time of a clock that was not set, like `Capture.known_time`."""
-    if Base.DateTime in first and not is_clock_set(first[Base.DateTime].data.decode("latin-1")):
-        return {tag: entry for tag, entry in first.items() if tag != Base.DateTime}
-    return first
+def _without_unset_clock(directory: Directory) -> Directory:
+    """The directory without the times of a clock that was not set, like `Capture.known_time`."""
+    dates = [directory[tag].data for tag in _TIMES if tag in directory and tag.name.startswith("DateTime")]
+    if all(is_clock_set(date.decode("latin-1")) for date in dates):
+        return directory
+    return {tag: entry for tag, entry in directory.items() if tag not in _TIMES}
 
 
 def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:

@@ -269,12 +269,19 @@ def compact_lists(text: str) -> str:
 
 
 def write_model(path: Path, model: "BaseModel | None") -> None:
-    """Write a model atomically as indented JSON; None removes the file of an earlier run. Raises OutputError."""
+    """Write a model atomically as indented JSON; None removes the file of an earlier run. Raises OutputError.
+
+    A file with this content already keeps its time, by which pages are known to be newer.
+    """
     if model is None:
         with suppress(OSError):
             path.unlink(missing_ok=True)
         return
-    write_text(path, compact_lists(model.model_dump_json(by_alias=True, indent=1)) + "\n")
+    text = compact_lists(model.model_dump_json(by_alias=True, indent=1)) + "\n"
+    with suppress(OSError):
+        if read_regular(path) == text.encode():
+            return
+    write_text(path, text)
 
 
 def read_model(path: Path, model: type[_Model]) -> _Model | None:

@@ -57,6 +57,18 @@ def test_reflectance_by_panel_is_the_truth(by_panel: Path, by_sun: Path) -> None
         assert set(stack.units) == {"1"}
 
 
+def test_a_run_that_changes_nothing_leaves_the_pages_of_a_flight_with_panels(
+    between_panels: Path, by_panel: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(by_panel, out)
+    pages = [out / "index.html", out / PANELS_FILE]
+    before = [path.stat().st_mtime_ns for path in pages]
+    reports = agalign.align_folder(between_panels, out, settings=seeded(radiometry="panel"))
+    assert {report.state for report in reports} == {"kept"}
+    assert [path.stat().st_mtime_ns for path in pages] == before
+
+
 @pytest.mark.parametrize("name", [PANELS_FILE, SKY_FILE, "0000SET/000/IMG_0001.panel.png"])
 def test_files_of_the_user_are_neither_replaced_nor_removed(between_panels: Path, tmp_path: Path, name: str) -> None:
     of_user = tmp_path / name

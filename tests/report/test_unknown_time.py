@@ -28,6 +28,8 @@ def test_a_clock_that_was_not_set_is_no_time_in_any_file(flight: Path, tmp_path:
     assert len(texts) == 5
     assert [path.name for path in texts if "1970" in path.read_text()] == []
     assert read_json(out / f"{capture.label}.json")["captured_at"] == ""
+    rasters = [path for path in out.rglob("*.tif") if b"1970:01:01" in path.read_bytes()]
+    assert rasters == []
     with rasterio.open(out / f"{capture.label}.tif") as stack:
         assert "TIFFTAG_DATETIME" not in stack.tags()
     page = (out / "index.html").read_text()
