@@ -52,18 +52,17 @@ def _align(
     dask = given["run"].pop("executor")
     options = RunOptions(**given["run"], command=command_line())
     cores = options.jobs or usable_cores()
-    for name in settings.write.indices:
-        index_named(name)
+    requested = [index_named(name) for name in settings.write.indices]
     load_ahead()
     from agalign.batch.workers import start_server_ahead
     from agalign.cli.align_run import conclude, find_captures, print_plan, run
+    from agalign.spectral_indices.rasters import is_of_raw_numbers
 
     reading = DiscoverOptions(**given["discover"], skip=(target,), jobs=cores, timeout_s=options.timeout_s)
     flight = find_captures(folder, reading, terminal)
     if not dask and not dry_run:
         start_server_ahead(len(flight.captures), cores, has_timeout=options.timeout_s is not None)
-    raw_numbers = any(b.dtype[0] in "ui" for c in flight.captures for b in c.bands)
-    if settings.write.indices and settings.write.radiometry == "off" and raw_numbers:
+    if any(is_of_raw_numbers(index, c, settings.write) for index in requested for c in flight.captures):
         terminal.problem(RAW_NUMBERS)
     if dry_run:
         return print_plan(flight, target, settings, options, terminal, model)

@@ -18,7 +18,7 @@ from agalign.records.captures import AlignedBand, LeftOut, RunCapture, differing
 from agalign.records.listed_files import ListedFiles
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
-from agalign.values.radiometry import MAX_REFLECTANCE
+from agalign.values.radiometry import MAX_REFLECTANCE, are_raw_numbers
 from agalign.values.spectrum import with_wavelength
 
 RAW = "raw numbers"
@@ -66,8 +66,7 @@ class BandReader(ExitStack):
         source = self.file(band.file, band.band_index)
         if quantity := self.quantity(band):
             return quantity.split(" and ")
-        is_integer = np.dtype(source.dtypes[band.band_index - 1]).kind in "ui"
-        if is_integer and source.scales[band.band_index - 1] == 1.0:
+        if are_raw_numbers(source.dtypes[band.band_index - 1], source.scales[band.band_index - 1]):
             return [RAW]
         size_px = source.width, source.height
         sample_px = reduced_size_px(size_px, max(1.0, max(size_px) / _SAMPLE_PX))

@@ -36,6 +36,7 @@ from agalign.spectral_indices.formulas import Index, bands_for, compute, index_n
 from agalign.values.capture import Band, Capture
 from agalign.values.fields import equal
 from agalign.values.image import Tile, reduced_size_px
+from agalign.values.radiometry import are_raw_numbers
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
 
@@ -214,9 +215,16 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
             raise ConfigurationError(
                 f"--index {name}: needs bands {', '.join(index.roles)}, and no capture has them all; there are {names}"
             )
-        are_integers = all(np.dtype(b.dtype).kind in "ui" for c in suitable for b in c.bands)
-        if suitable and settings.radiometry == "off" and are_integers and not index.any_unit:
+        are_raw = all(is_of_raw_numbers(index, c, settings) for c in suitable)
+        if suitable and are_raw and not index.any_unit:
             raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
+
+
+def is_of_raw_numbers(index: Index, capture: Capture, settings: WriteSettings) -> bool:
+    """Return True if a capture has the bands of an index, and the files will have raw numbers of one of them."""
+    used = [band for band in capture.bands if role_of_band(band) in index.roles]
+    are_raw = any(are_raw_numbers(band.dtype, band.scale_offset[0]) for band in used)
+    return are_raw and settings.radiometry == "off" and _has_bands(used, index)
 
 
 def _has_bands(bands: Sequence[Band], index: Index) -> bool:

@@ -49,6 +49,13 @@ def total_percent(errors: Iterable[RadiometricError]) -> float:
     return math.sqrt(sum(part.std_percent**2 for part in errors))
 
 
+def are_raw_numbers(dtype: str, scale: float) -> bool:
+    """Return True for the pixels of a file that are raw numbers unless a tag states their quantity: integers without a
+    scale, for which files have 1.
+    """
+    return dtype.startswith(("u", "i")) and scale == 1.0
+
+
 @dataclass(frozen=True)
 class ReflectanceFactor:
     """Factor from radiance to reflectance."""

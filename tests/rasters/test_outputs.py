@@ -23,6 +23,7 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
 
 from ..conftest import Shared, read_json, seeded, textured_image, write_band, write_capture
+from ..program import agalign_here
 from ..run_outputs import change, indices_of
 
 pytestmark = pytest.mark.slow
@@ -136,6 +137,20 @@ def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
 def test_an_index_that_no_capture_can_have_is_refused_first(tmp_path: Path, index: str, problem: str) -> None:
     with pytest.raises(agalign.ConfigurationError, match=problem):
         written(tmp_path, agalign.Settings(write=agalign.WriteSettings(indices=(index,))))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-4])
+def test_both_commands_take_integers_with_a_scale_as_reflectance(tmp_path: Path, scale: float) -> None:
+    red, nir = ((3000 + gain * textured_image(300, 240, 3)).clip(1) for gain in (500, 700))
+    path, out, is_raw = tmp_path / "in" / "field.tif", tmp_path / "out", scale == 1.0
+    write_band(path, np.stack([red, nir]).astype(np.uint16))
+    with rasterio.open(path, "r+") as dataset:
+        dataset.descriptions, dataset.scales = ("red", "nir"), (scale, scale)
+    plan = agalign_here("align", path.parent, "-o", out, "--index", "ndvi,savi", "--dry-run")
+    assert ["raw numbers" in plan.stderr, "savi: needs reflectance" in plan.stderr] == [is_raw] * 2
+    written(tmp_path, agalign.Settings())
+    ndvi, savi = indices_of(out, "ndvi", "savi")
+    assert [ndvi.raw_numbers, "needs reflectance" in savi.problem] == [is_raw] * 2
 
 
 def test_indices_go_with_the_stack_that_they_were_made_of(tmp_path: Path) -> None:
