@@ -468,14 +468,14 @@ def _tags(index: Index, like: OpenRaster, unit: str, source: str, *, is_masked: 
 def _statistics(
     index: Index, unit: str, sample: NDArray[np.float32], valid_share: float, masked_share: float
 ) -> IndexStatistics:
-    masked_share = round(masked_share, 6)
+    valid_share, masked_share = round(valid_share, 6), round(masked_share, 6)
     if not sample.size:
-        return IndexStatistics(unit=unit, low=0.0, high=1.0, masked_share=masked_share)
+        return IndexStatistics(valid_share=valid_share, unit=unit, low=0.0, high=1.0, masked_share=masked_share)
     low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(sample, (2, 5, 50, 95, 98)))
     if index.span is not None and unit != RAW:
         low, high = index.span
     # The ends of the colour scale must differ.
-    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + 1e-3), masked_share)
+    return IndexStatistics(median, p5, p95, valid_share, unit, low, max(high, low + 1e-3), masked_share)
 
 
 def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:

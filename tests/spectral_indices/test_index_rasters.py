@@ -172,6 +172,16 @@ def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
     assert by_formula.median == ndre.median
 
 
+def test_pixels_that_the_percentiles_skip_are_valid(tmp_path: Path) -> None:
+    plane = np.full((2001, 2001), np.nan, np.float32)
+    plane[1::2, 1::2] = 0.2
+    write_band(tmp_path / "a.tif", np.stack([plane, 2 * plane]))
+    bands = [AlignedBand(name, None, tmp_path / "a.tif", number) for number, name in enumerate(("red", "nir"), start=1)]
+    (report,) = write_rasters(bands, [INDICES["ndvi"]], tmp_path / "a", "a")
+    assert np.isnan(report.median)
+    assert report.statistics.valid_share == pytest.approx(0.25, abs=1e-3)
+
+
 def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> None:
     import cv2
 
