@@ -81,13 +81,13 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
             # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
             return np.float32(value)
-        case ast.BinOp(left=left, op=ast.Div(), right=right):
-            dividend = _value(left, values)
-            # nan where a denominator of bands is not positive beyond the noise of its terms.
-            divisor, magnitude = _sum(right, values)
-            if any(isinstance(part, ast.Name) for part in ast.walk(right)):
-                divisor = np.where(divisor > _NOISE * magnitude, divisor, np.float32(np.nan))
-            return dividend / divisor
+        case ast.BinOp(left, ast.Div(), ast.BinOp(base, ast.Pow(), right)) if _is_number(right):
+            return _value(left, values) / _divisor(base, _value(right, values), values)
+        case ast.BinOp(left, ast.Div(), right):
+            return _value(left, values) / _divisor(right, np.float32(1), values)
+        case ast.BinOp(base, ast.Pow(), right) if _is_number(right):
+            power = _value(right, values)
+            return np.float32(1) / _divisor(base, -power, values) if power < 0 else _value(base, values) ** power
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
@@ -98,6 +98,24 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         f"'{ast.unparse(node)}' is not allowed in a formula; use band letters, numbers, + - * / **, parentheses, "
         f"{', '.join(_FUNCTIONS)}"
     )
+
+
+def _is_number(node: ast.expr) -> bool:
+    """Return True for a part of a formula without names, also of functions."""
+    return not any(isinstance(part, ast.Name) for part in ast.walk(node))
+
+
+def _divisor(base: ast.expr, power: Any, values: Mapping[str, FloatImage]) -> Any:
+    """Return the value of the denominator base ** power.
+
+    If it has bands, it is nan where it is not positive, and where its base is not beyond the noise of its terms.
+    """
+    value, magnitude = _sum(base, values)
+    divisor = value**power
+    if _is_number(base):
+        return divisor
+    is_certain = (np.abs(value) > _NOISE * magnitude) & (divisor > 0)
+    return np.where(is_certain, divisor, np.float32(np.nan))
 
 
 def _sum(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any]:

@@ -124,6 +124,8 @@ def test_a_formula_has_the_value_of_its_arithmetic() -> None:
     assert value[0, 0] == pytest.approx(-(0.4**2) / 0.6 + 3, rel=1e-6)
     assert not np.isfinite(value[0, 1:]).any()
     assert np.isinf(evaluate("9**9**9 + 0*N", {"N": n})).all(), "and takes no time"
+    towers = "N**" + "1**(" * 50 + "1" + ")" * 50, "(" * 40 + "N" + ")**-1" * 40, "N/(1/" * 40 + "N**-2" + ")" * 40
+    assert [evaluate(tower, {"N": n}).shape for tower in towers] == [n.shape] * 3, "and these take none either"
     golden_ratio = evaluate("1/(1+" * 40 + "N" + ")" * 40, {"N": n})
     np.testing.assert_allclose(golden_ratio[0, ::2], (5**0.5 - 1) / 2, rtol=1e-6)
 
@@ -368,6 +370,22 @@ def test_values_and_nodata() -> None:
     noise = compute(INDICES["ndvi"], [np.float32([[-0.01, 0.03]]), np.float32([[0.006, -0.01]])])
     visible = np.float32([[[0.1, 0.05]], [[0.02, 0.04]], [[0.118, 0.19]]])
     assert np.isnan([noise, compute(INDICES["vari"], list(visible))]).all()
+
+
+@pytest.mark.parametrize(
+    ("power", "division"),
+    [
+        ("(G-R) * (G+R-B)**-1", "(G-R) / (G+R-B)"),
+        ("(G+R-B)^(-1/2)", "1 / (G+R-B)**0.5"),
+        ("(G-R)**-2.0", "1 / ((G-R) * (G-R))"),
+    ],
+)
+def test_a_negative_power_is_a_division(power: str, division: str) -> None:
+    bands = {"G": [0.1, 0.5, 0.1, 0.0, 0.0], "R": [0.02, 0.1, 0.4, 0.0, 0.1], "B": [0.118, 0.1, 0.1, 0.0, 0.2]}
+    values = {name: np.float32([band]) for name, band in bands.items()}
+    by_power, by_division = evaluate(power, values), evaluate(division, values)
+    assert 0 < np.isfinite(by_power).sum() < 5
+    np.testing.assert_allclose(by_power, by_division, rtol=1e-5)
 
 
 def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
