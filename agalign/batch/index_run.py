@@ -9,7 +9,7 @@ import cv2
 
 from agalign.batch.capture_task import quiet
 from agalign.batch.workers import failure_text, numbers_of_workers, open_workers, serially
-from agalign.errors import AgalignError
+from agalign.errors import AgalignError, ConfigurationError
 from agalign.host.files import REPORT_FILE, written_below
 from agalign.host.processes import usable_cores
 from agalign.records.captures import bands_of
@@ -54,8 +54,10 @@ def index_tasks(
     out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run, and ConfigurationError
-    if another folder is the target and has a table that no command has written.
+    without indices, or if another folder is the target and has a table that no command has written.
     """
+    if not indices:
+        raise ConfigurationError("no index is given; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
     if target != out:
         refuse_foreign_table(target)
     sidecars = counted_sidecars(run_sidecars(out), out)

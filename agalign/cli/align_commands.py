@@ -44,7 +44,7 @@ def _align(
         agalign orchard/ --relief --error-map  correct parallax of trees; map the expected error
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.spectral_indices.formulas import index_named
+    from agalign.spectral_indices.formulas import chosen_indices
 
     source = folder.resolve()
     target = out or source.parent / f"{source.name}-aligned"
@@ -52,7 +52,7 @@ def _align(
     dask = given["run"].pop("executor")
     options = RunOptions(**given["run"], command=command_line())
     cores = options.jobs or usable_cores()
-    requested = [index_named(name) for name in settings.write.indices]
+    requested = chosen_indices(settings.write.indices)
     load_ahead()
     from agalign.batch.workers import start_server_ahead
     from agalign.cli.align_run import conclude, find_captures, print_plan, run

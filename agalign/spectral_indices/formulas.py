@@ -181,12 +181,11 @@ INDICES: Mapping[str, Index] = {
 
 
 def chosen_indices(names: Sequence[str], formulas: Sequence[str] = ()) -> list[Index]:
-    """Return the indices of names and formulas. Raises ConfigurationError for none, an unknown or a repeated one."""
+    """Return the indices of names and formulas. Raises ConfigurationError for an unknown or a repeated one."""
     chosen = [index_named(name) for name in names if name.strip()] + [index_of_formula(f) for f in formulas]
     repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
-    if repeated or not chosen:
-        problem = f"index '{repeated[0]}' is given twice" if repeated else "no index is given"
-        raise ConfigurationError(f"{problem}; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
+    if repeated:
+        raise ConfigurationError(f"index '{repeated[0]}' is given twice; give it once, and formulas as 'name=N/R'")
     return chosen
 
 

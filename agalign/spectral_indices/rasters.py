@@ -32,7 +32,7 @@ from agalign.records.captures import AlignedBand, bands_of
 from agalign.records.listed_files import ListedFiles
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.before_alignment import index_before
-from agalign.spectral_indices.formulas import Index, bands_for, compute, index_named, index_of_formula
+from agalign.spectral_indices.formulas import Index, bands_for, chosen_indices, compute, index_named, index_of_formula
 from agalign.values.capture import Band, Capture
 from agalign.values.fields import equal
 from agalign.values.image import Tile, reduced_size_px
@@ -174,7 +174,7 @@ class IndexRasters(Product):
         Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
         """
         base, label = context.paths.file(""), context.capture.label
-        requested = [index_named(name) for name in context.settings.write.indices]
+        requested = chosen_indices(context.settings.write.indices)
         earlier = [raster for raster in index_rasters(base) if raster.name not in {one.name for one in requested}]
         if not (requested or earlier):
             return
@@ -206,18 +206,18 @@ class IndexRasters(Product):
 
 
 def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
-    """Raise ConfigurationError for an unknown index, and for an index that no capture has the bands or unit for."""
-    for name in settings.indices:
-        index = index_named(name)
+    """Raise ConfigurationError for an unknown or repeated index, or one that no capture has the bands or unit for."""
+    for index in chosen_indices(settings.indices):
         suitable = [c for c in captures if _has_bands(c.bands, index)]
         if captures and not suitable:
             names = ", ".join(dict.fromkeys(b.name for c in captures for b in c.bands))
             raise ConfigurationError(
-                f"--index {name}: needs bands {', '.join(index.roles)}, and no capture has them all; there are {names}"
+                f"--index {index.name}: needs bands {', '.join(index.roles)}, and no capture has them all; "
+                f"there are {names}"
             )
         are_raw = all(is_of_raw_numbers(index, c, settings) for c in suitable)
         if suitable and are_raw and not index.any_unit:
-            raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
+            raise ConfigurationError(f"--index {index.name}: needs reflectance; add --radiometry")
 
 
 def is_of_raw_numbers(index: Index, capture: Capture, settings: WriteSettings) -> bool:

@@ -61,6 +61,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align x --outptu o", 2, "no such option: --outptu (did you mean '--out'?)"),
         ("align {flight} -o {tmp}/o --index nvdi", 2, "unknown index 'nvdi' (did you mean 'ndvi'?); choose from ndvi"),
         ("indices {flight} --index nvdi", 2, "unknown index 'nvdi' (did you mean 'ndvi'?); choose from ndvi"),
+        ("align {flight} -o {tmp}/o --index ndvi,NDVI", 2, "'ndvi' is given twice"),
         ("indices {flight} --index ndvi,ndvi", 2, "'ndvi' is given twice"),
         ("indices {flight} --index ,", 2, "no index is given"),
         ("indices {flight} --formula import", 2, "is not a formula"),
