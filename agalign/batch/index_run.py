@@ -89,9 +89,9 @@ def run_indices(
             for number, result in run_tasks(do_indices, tasks):
                 try:
                     reports = result()
-                    rows += reports
                 except Exception as error:
                     reports = _failed(tasks[number], failure_text(error))
+                rows += reports
                 yield reports
     finally:
         if rows:  # also after an interruption

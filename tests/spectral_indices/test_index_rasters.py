@@ -257,6 +257,17 @@ def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
     assert good.path is not None
 
 
+def test_every_capture_that_failed_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_aligned(tmp_path, 2)
+    write_pages(tmp_path, pytest.fail)
+    os.truncate(tmp_path / "0000SET" / "IMG_0001.json", 900)
+    monkeypatch.setattr(index_run, "write_rasters", raising(MemoryError()))
+    indices_of(tmp_path)
+    damaged, without_memory = table_in(tmp_path / "indices.csv")
+    assert "IMG_0001.json" in damaged["problem"]
+    assert "out of memory" in without_memory["problem"]
+
+
 @pytest.mark.parametrize(("name", "problem"), [("green", "file of a band"), ("mine", "differs in size")])
 def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
     tmp_path: Path, name: str, problem: str
