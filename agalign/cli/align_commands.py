@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from agalign.batch.preload import preload_libraries
-from agalign.cli.command import Command, Given, load_config
+from agalign.cli.command import Command, Given
+from agalign.cli.config_file import load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
 from agalign.host.processes import usable_cores
 from agalign.values.choices import MAX_MOSAIC_PIXELS

@@ -1,4 +1,4 @@
-"""Aligning a flight from the command line: progress line, reports of captures, and summary.
+"""Aligning a flight from the command line: reports of captures, and summary.
 
 The commands import this module when they run, because the libraries that it needs take half a second.
 """
@@ -6,9 +6,9 @@ The commands import this module when they run, because the libraries that it nee
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
-from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, explain
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, explain, progress
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
@@ -211,40 +211,6 @@ def _listener(terminal: Terminal, show: Callable[[float, str], None]) -> "Listen
 def cluster(dask: str | None, jobs: int) -> AbstractContextManager[Executor | None]:
     """Connect to a Dask cluster if its address is given."""
     return nullcontext() if dask is None else dask_executor(dask, jobs)
-
-
-@contextmanager
-def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[float, str, int], None]]:
-    """Show a progress line on a terminal; yield the function that updates it.
-
-    Its arguments are the number of finished captures, with the finished share of the current one, a description, and
-    the number of captures that needed no time, which count neither for the rate nor for the time that is left.
-    """
-    if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
-        yield lambda *_: None
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.table import Column
-
-    columns = (
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[done]} of {task.fields[captures]} captures"),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
-    )
-    with Progress(*columns, console=terminal.err, transient=True, speed_estimate_period=600) as line:
-        task = line.add_task("starting", total=captures, done=0, captures=captures, rate="")
-
-        def show(done: float, text: str, skipped: int) -> None:
-            speed = line.tasks[0].speed
-            rate = "" if speed is None else f"{60 * speed:.0f} a minute"
-            description, total = escape_controls(text), captures - skipped
-            line.update(task, description=description, total=total, completed=done - skipped, done=int(done), rate=rate)
-
-        yield show
 
 
 def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.cli.align_commands import align
-from agalign.cli.command import Command, Given, config_text
+from agalign.cli.command import Command, Given
+from agalign.cli.config_file import config_text
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
 from agalign.host.text import counted

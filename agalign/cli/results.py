@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.cli.command import Command, Given
-from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, explain
+from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, explain, progress
 from agalign.host.files import INDICES_FILE, REPORT_FILE, SUMMARY_FILE
 from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
@@ -163,7 +163,7 @@ def _indices(
         agalign indices aligned/ --index ndvi,ndre,savi -o indices/  three indices, into another folder
     """
     from agalign.batch.index_run import index_tasks, run_indices
-    from agalign.cli.align_run import cluster, progress
+    from agalign.cli.align_run import cluster
     from agalign.errors import OutputError
     from agalign.host.output_folder import locked
     from agalign.spectral_indices.formulas import chosen_indices

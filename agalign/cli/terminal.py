@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import IntEnum
@@ -248,3 +248,37 @@ def printed() -> Iterator[None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             print(f"agalign: standard output: {error.strerror}", file=sys.stderr)
             raise SystemExit(ExitCode.NOTHING) from None
+
+
+@contextmanager
+def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[float, str, int], None]]:
+    """Show a progress line on a terminal; yield the function that updates it.
+
+    Its arguments are the number of finished captures, with the finished share of the current one, a description, and
+    the number of captures that needed no time, which count neither for the rate nor for the time that is left.
+    """
+    if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
+        yield lambda *_: None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.table import Column
+
+    columns = (
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[done]} of {task.fields[captures]} captures"),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
+    )
+    with Progress(*columns, console=terminal.err, transient=True, speed_estimate_period=600) as line:
+        task = line.add_task("starting", total=captures, done=0, captures=captures, rate="")
+
+        def show(done: float, text: str, skipped: int) -> None:
+            speed = line.tasks[0].speed
+            rate = "" if speed is None else f"{60 * speed:.0f} a minute"
+            description, total = escape_controls(text), captures - skipped
+            line.update(task, description=description, total=total, completed=done - skipped, done=int(done), rate=rate)
+
+        yield show
