@@ -119,7 +119,7 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
                     task.sidecar, IndexRasters.kind, [p for path in rasters for p in (path, path.with_suffix(".png"))]
                 )
         by_name = {index.name: index for index in task.indices}
-        checks = [to_check(by_name[r.index], sidecar, task.facts, task.label) for r in reports]
+        checks = [to_check(by_name[r.index], r.statistics.unit, sidecar, task.facts, task.label) for r in reports]
         reports = [r if r.problem else replace(r, problem=check) for r, check in zip(reports, checks, strict=True)]
     except AgalignError as error:
         reports = _failed(task, str(error))

@@ -37,6 +37,7 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
 _FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log, "exp": np.exp, "abs": np.abs}
 _NOISE = 0.02
 """Noise of reflectance relative to its value: a difference below this share of its terms has no certain sign."""
+_OF_USER = "formula of the user"
 _ROLE_OF_SYMBOL = {symbol: role for role, spectral_range in ROLES.items() for symbol in spectral_range.symbols}
 
 
@@ -143,7 +144,12 @@ class Index:
     source: str = ""
     constants: tuple[tuple[str, float], ...] = ()
     any_unit: bool = True
-    """False if the formula applies to reflectance only."""
+    """False if the value depends on the unit of the bands, which should be reflectance."""
+
+    @property
+    def is_of_user(self) -> bool:
+        """True for a formula of the user, which may be of bands in any unit, whatever its value then means."""
+        return self.source == _OF_USER
 
     @cached_property
     def symbols(self) -> tuple[str, ...]:
@@ -212,9 +218,7 @@ def index_of_formula(text: str) -> Index:
     name, formula = (name.strip().lower(), formula) if equals else ("formula", text)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in INDICES:
         raise ConfigurationError(f"'{name}' cannot name a formula; use letters, digits and _, and no index's name")
-    index = Index(name, formula.strip(), source="formula of the user")
-    _check_bands(index)
-    return index
+    return _checked(Index(name, formula.strip(), source=_OF_USER))
 
 
 @cache
@@ -231,24 +235,22 @@ def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
     formula = str(entry["formula"])
     defaults = {k: v.get("default") for k, v in _data_of_spyndex("constants.json").items()}
     constants = tuple((s, float(defaults[s])) for s in symbols_of(formula) if defaults.get(s) is not None)
-    index = Index(name, formula, source=str(entry.get("reference", "")), constants=constants)
-    _check_bands(index)
-    return replace(index, any_unit=_is_of_any_unit(index))
+    return _checked(Index(name, formula, source=str(entry.get("reference", "")), constants=constants))
 
 
-def _check_bands(index: Index) -> None:
-    """Raise ConfigurationError if the formula has no band, or a name that is not that of a band."""
+def _checked(index: Index) -> Index:
+    """Return an index with `any_unit` by its formula: True if the same factor in all bands does not change its value.
+
+    Raises ConfigurationError if the formula has no band, or a name that is not that of a band.
+    """
     unknown = [s for s in index.symbols if s.upper() not in _ROLE_OF_SYMBOL]
     if unknown or not index.symbols:
         used = ", ".join(unknown) or "no band"
         raise ConfigurationError(f"index '{index.name}', {index.formula}, uses {used}; the bands are B, G, R, RE and N")
-
-
-def _is_of_any_unit(index: Index) -> bool:
-    """True if the value does not change when all bands are multiplied by the same number."""
     bands = [np.array([0.1 * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
     scaled = [b * np.float32(1000) for b in bands]
-    return bool(np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True))
+    any_unit = np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True)
+    return replace(index, any_unit=bool(any_unit))
 
 
 def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float | None]) -> list[int]:

@@ -23,17 +23,20 @@ _OF_CAPTURE = "folder", "capture", "captured_at", "latitude", "longitude"
 _OF_INDEX = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
 
 
-def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts, label: str) -> str:
-    """Return what to check in the bands of an index of a capture, given its run and label; empty if there is nothing,
-    or if the formula is unknown.
+def to_check(index: Index | None, unit: str, sidecar: Sidecar, run: RunFacts, label: str) -> str:
+    """Return what to check in the bands of an index of a capture, given their unit, its run and label; empty if there
+    is nothing, or if the formula is unknown.
     """
     if index is None:
         return ""
+    result = []
+    if not index.any_unit and unit != "reflectance":
+        result.append(f"its value depends on the unit of the bands, which are {unit}, not reflectance")
     with suppress(InputError):  # other bands than those of the sidecar
         names = [b.band for b in sidecar.bands]
         used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}
-        return "; ".join(f"{c.band}: {c.reason}" for c in run.cautions(sidecar, label) if c.band in used)
-    return ""
+        result += [f"{c.band}: {c.reason}" for c in run.cautions(sidecar, label) if c.band in used]
+    return "; ".join(result)
 
 
 def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[IndexReport]:
@@ -47,7 +50,7 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[
             name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
             if (raster := IndexRaster.read(path)) is not None:
                 label = Path(folder, sidecar.capture).as_posix()
-                problem = to_check(raster.index, sidecar, run, label)
+                problem = to_check(raster.index, raster.statistics.unit, sidecar, run, label)
                 report = IndexReport(label, name, path, raster.statistics, problem, is_masked=raster.is_masked)
                 result.append(report.of(sidecar))
     return result

@@ -406,7 +406,7 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
     if len(units) > 1:
         raise InputError(f"its bands are in different units ({', '.join(sorted(units))})")
     (unit,) = units
-    if not index.any_unit and unit != "reflectance":
+    if not (index.any_unit or index.is_of_user) and unit != "reflectance":
         raise InputError(f"needs reflectance, and the bands are {unit}; align with --radiometry")
     return unit
 

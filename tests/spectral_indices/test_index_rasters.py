@@ -42,6 +42,7 @@ from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
 from ..conftest import raising, write_band
+from ..program import agalign_here
 from ..run_outputs import aligned, context_of, indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
@@ -201,6 +202,21 @@ def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> Non
     assert np.ptp(grey, axis=2).max() == 0
     assert np.ptp(colour, axis=2).max() > 50
     assert np.ptp(grey) > 150, "stretched over all greys"
+
+
+def test_a_formula_of_the_user_that_depends_on_the_unit_is_told(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif", "r+") as dataset:
+        for number in dataset.indexes:
+            dataset.update_tags(number, QUANTITY="radiance")
+    list_stack(tmp_path / "0000SET" / "IMG_0001.json")
+    formulas = "--formula", "mine=1.5*(N-R)/(N+R+0.5)", "--formula", "ratio=1.5*(N-R)/(N+R)"
+    done = agalign_here("indices", tmp_path, *formulas)
+    assert done.returncode == 0
+    problem = "its value depends on the unit of the bands, which are radiance, not reflectance"
+    assert done.stderr.endswith(f"(column problem of indices.csv), such as 0000SET/IMG_0001 mine: {problem}\n")
+    write_pages(tmp_path, pytest.fail)
+    assert [row["problem"] for row in table_in(tmp_path / "indices.csv")] == [problem, ""]
 
 
 def test_only_new_indices_are_calculated(tmp_path: Path) -> None:
