@@ -47,7 +47,7 @@ from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
-from agalign.values.residual import Residual, decrease_in_standard_errors
+from agalign.values.residual import Residual, decrease_in_standard_errors, lengths_in_common_px
 from agalign.verify.checks import BY_PARALLAX, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
@@ -366,15 +366,18 @@ def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> boo
 
 def _decreases_shifts(plane: Residual, relief: Residual) -> bool:
     """Return True if a relief decreases the p95 of held-out windows by more than it increases their median, and their
-    shifts by more than by chance.
+    shifts by more than by chance, in the windows that both have measured.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
     """
     # Standard errors: at most 3.0 in flat scenes with noise, at least 5.4 with boxes, booms, trees and leaves. The p95
     # alone is that of wrong peaks where images are noisy.
     min_decrease = 4.0
-    p95_decrease_px, median_increase_px = plane.p95_px - relief.p95_px, relief.median_px - plane.median_px
-    is_smaller = p95_decrease_px >= max(0.0, median_increase_px)
+    before_px, after_px = lengths_in_common_px(plane, relief)
+    if not len(before_px):
+        return False
+    median_increase_px, p95_increase_px = np.percentile(after_px, (50, 95)) - np.percentile(before_px, (50, 95))
+    is_smaller = bool(-p95_increase_px >= max(0.0, median_increase_px))
     return is_smaller and decrease_in_standard_errors(plane, relief) >= min_decrease
 
 

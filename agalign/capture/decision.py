@@ -11,9 +11,10 @@ The estimators propose; `decide` chooses. For each band, the first row that appl
 | the seed                                  | otherwise                                        | `failed`    |
 
 A capture has a relief if one fits half of the bands that it is estimated from better than their homographies, and of
-several the one that delivers most bands: all bands of its reference image then have this geometry. (1) The candidate
-under it is `aligned` without issues, else `predicted`. (2) A candidate without issues is `aligned`, but beside a relief
-it is `predicted`, as indices would mix two geometries. Every standard error is the RMS of `Candidate.error`.
+several the one by which the images deliver most bands: all bands of its reference image then have this geometry. (1)
+The candidate under it is `aligned` without issues, else `predicted`. (2) A candidate without issues is `aligned`, but
+beside a relief it is `predicted`, as indices would mix two geometries. Every standard error is the RMS of
+`Candidate.error`.
 `Alignment.status` follows from the issues and the prediction that are set here.
 
 The prediction of the rig of the flight replaces what contradicts it, seeds, what has failed, and predictions that are
@@ -41,18 +42,18 @@ def decide(
 
     `predictions` are those of the rig by band.
     """
-    predictions = predictions or {}
-    return _aligned(bands, _chosen_relief(bands, reliefs, predictions), predictions)
+    return _aligned(bands, _chosen_relief(bands, reliefs), predictions or {})
 
 
-def _chosen_relief(
-    bands: Sequence[BandCandidates], reliefs: Sequence[ReliefCandidates], predictions: Mapping[str, RigPrediction]
-) -> ReliefCandidates | None:
-    """The relief of the capture; None if no relief fits half of its bands."""
+def _chosen_relief(bands: Sequence[BandCandidates], reliefs: Sequence[ReliefCandidates]) -> ReliefCandidates | None:
+    """The relief of the capture, by its images alone: predictions by the rig have this relief; None if no relief fits
+    half of its bands.
+    """
     fitting = [relief for relief in reliefs if relief.fits_better]
 
-    def delivered(relief: ReliefCandidates) -> int:
-        return sum(a.is_usable(DELIVERED_STD_PX) for a in _aligned(bands, relief, predictions).values())
+    def delivered(relief: ReliefCandidates) -> tuple[int, int]:
+        alignments = _aligned(bands, relief, {}).values()
+        return sum(a.is_usable(DELIVERED_STD_PX) for a in alignments), sum(a.status == "aligned" for a in alignments)
 
     return max(fitting, key=delivered) if len(fitting) > 1 else next(iter(fitting), None)
 

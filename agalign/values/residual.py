@@ -180,12 +180,12 @@ def decrease_in_standard_errors(before: Residual, after: Residual) -> float:
     It is that of log(1 + (length / 0.3 px)^2), which is robust to wrong peaks. The windows are of one grid.
     """
     scale_px = 0.3
-    before_px, after_px = _lengths_in_common_px(before, after)
+    before_px, after_px = lengths_in_common_px(before, after)
     losses = [np.log1p((px / scale_px) ** 2) for px in (before_px, after_px)]
     return mean_in_standard_errors(losses[0] - losses[1]) if len(before_px) > 1 else 0.0
 
 
-def _lengths_in_common_px(one: Residual, other: Residual) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lengths_in_common_px(one: Residual, other: Residual) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lengths (m,) of the shifts of two residuals in windows that both have measured, px of the reference.
 
     Their windows are of one grid.

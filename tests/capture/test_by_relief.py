@@ -38,7 +38,7 @@ from agalign.values.issues import CLOSE_WINDOWS, NO_CONTRAST, RETRIEVAL, Issue, 
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.residual import Residual, _lengths_in_common_px
+from agalign.values.residual import Residual, lengths_in_common_px
 
 from ..builders import grid_px, in_full_run, joint_result, residual_of, whole
 from ..conftest import Shared, textured_image
@@ -496,7 +496,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
 def test_the_error_of_a_baseline_by_one_other_band_is_known_to_a_factor_only(
     boxes: Rendered, candidates: Sequence[RefinedBand]
 ) -> None:
-    """One band has one degree of freedom: the mean square is doubled."""
+    """One band has one degree of freedom: the mean square is tripled."""
     names, relief = [c.pair.name for c in candidates], Relief(np.full((8, 8), 2.0, np.float32), np.ones((8, 8)))
     nothing, (own, other, *_) = dict.fromkeys(names, 0.0), [c.pair for c in candidates]
     baselines = {**dict.fromkeys(names, (0.0, 0.0)), other.name: (0.8, 0.0), own.name: (0.0, 0.6)}
@@ -504,7 +504,7 @@ def test_the_error_of_a_baseline_by_one_other_band_is_known_to_a_factor_only(
     off = 0.1  # across the baseline by the rig
     parallax, std_px = _parallax_by_rig(own, [(other, Parallax(relief, (0.8, off)))], rig)
     assert parallax.baseline == pytest.approx((0.0, 0.6))
-    assert std_px == pytest.approx(np.sqrt(2 * off**2 * (2 + (0.6 / 0.8) ** 2)) * relief.rms_px)
+    assert std_px == pytest.approx(np.sqrt(3 * off**2 * (2 + (0.6 / 0.8) ** 2)) * relief.rms_px)
 
 
 @pytest.mark.full
@@ -608,6 +608,17 @@ def windows_with(median_px: float, p95_px: float) -> Residual:
     return residual_of(grid_px(np.arange(18.0), np.arange(15.0)), shifts_px)
 
 
+def test_windows_that_a_relief_occludes_do_not_count_for_it() -> None:
+    """A tenth of the windows, with the largest shifts, is occluded under the relief; another tenth gets worse."""
+    centres_px, number = grid_px(np.arange(18.0), np.arange(15.0)), np.arange(270)[:, None] % 10
+    shifts_px = 0.5 * np.random.default_rng(0).normal(size=(270, 2))
+    plane = residual_of(centres_px, np.where(number == 0, 3.0, shifts_px))
+    relief = residual_of(centres_px, np.where(number == 1, 2.0, 0.1 * shifts_px)).where(number[:, 0] != 0)
+    assert relief.p95_px < plane.p95_px
+    assert not _decreases_shifts(plane, relief)
+    assert _decreases_shifts(plane, relief.where(number[relief.cells @ [1, 18], 0] != 1))
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_a_relief_that_only_moves_wrong_peaks_is_not_chosen(seed: int) -> None:
     """In noisy images a tenth of the windows have wrong peaks, whose p95 decreases by chance."""
@@ -627,7 +638,7 @@ def test_shifts_are_compared_in_the_windows_that_both_residuals_have_measured() 
     measured = plane.cells[:, 0] > 2
     relief = plane.with_shifts(np.where(measured[:, None], plane.shifts_px / 2, np.nan))
     shuffled = relief.where(np.random.default_rng(0).permutation(len(relief.cells))[:200])
-    before, after = _lengths_in_common_px(plane, shuffled)
+    before, after = lengths_in_common_px(plane, shuffled)
     assert len(before) == np.isfinite(shuffled.shifts_px[:, 0]).sum() < 200
     np.testing.assert_allclose(after, before / 2)
 

@@ -270,9 +270,9 @@ def test_a_band_under_the_relief_is_predicted_with_the_error_of_the_relief() -> 
     [
         (("Blue",), ("Blue", "Red"), 0.0, 1),
         (("Blue", "Red"), ("Blue",), 0.0, 0),
-        # Without accepted predictions the bands beside a relief are not delivered; with them, all are, and the first
-        # relief stays.
-        (("Blue",), ("Blue", "Red"), 1.0, 0),
+        # Without accepted predictions the bands beside a relief are not delivered; with them, all are, and more are
+        # aligned under the second relief.
+        (("Blue",), ("Blue", "Red"), 1.0, 1),
         (("Blue",), ("Red",), 0.0, 0),
     ],
 )
@@ -288,6 +288,19 @@ def test_of_two_reliefs_the_one_that_delivers_more_bands_is_that_of_all(
     result = Together().decided(*reliefs)
     used = {id(a.mapping.parallax.relief) for a in result.values() if a.mapping.parallax is not None}
     assert used == {id(c.mapping.parallax.relief) for c in reliefs[chosen].candidates.values()}
+
+
+def test_predictions_by_the_rig_which_have_the_relief_of_the_images_do_not_change_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(decision, "DELIVERED_STD_PX", 0.05)
+    bands, reliefs = list(Together().bands.values()), [relief_of("Blue"), relief_of("Blue", "Red")]
+    predictions = {name: rig_prediction(std_px=0.01, of=pair(name)) for name in ("Red", "NIR")}
+    by_images, result = decide(bands, reliefs), decide(bands, reliefs, predictions)
+    assert result["NIR"].prediction.source == "bands"
+    for name in ("Blue", "Red"):
+        assert result[name].mapping.parallax is by_images[name].mapping.parallax
+        assert result[name].status == "aligned"
 
 
 def test_a_relief_that_fits_worse_is_no_option() -> None:

@@ -221,4 +221,4 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
 
 def test_few_errors_may_be_small_by_chance() -> None:
     """The variance of a further error from the mean square of n: 2 for three, 1.03 for sixty."""
-    np.testing.assert_allclose(expected_square([1.0, 1.0], [3, 60]), [2.0, 61 / 59])
+    np.testing.assert_allclose(expected_square([1.0] * 4, [1, 2, 3, 60]), [3.0, 3.0, 2.0, 61 / 59])
