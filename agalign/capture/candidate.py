@@ -30,16 +30,16 @@ class Candidate:
     mapping: PixelMapping
     error: MappingError
     residual: Residual
-    """Windows without their own part in the fit, under the mapping without a displacement field, which other held-out
-    windows verify: descriptors and rig contribute to each half. Lens shapes are fitted to them: such a candidate only
-    predicts.
+    """Windows without their own part in the fit: of a homography, each under that by the other half, to which
+    descriptors and rig contribute; of a displacement field, each under one without the windows near it. Lens shapes are
+    fitted to them: such a candidate only predicts.
     """
     joint: JointResult | None = None
     """Evidence of descriptors or windows; None for a prediction by the rig."""
     images: WarpedPair | None = None
     """The images under the mapping, with the relief of other bands if it has one; None omits checks that use pixels."""
     other_residual: Residual | None = None
-    """More windows, which also have to pass the checks: those of another size, in which the mapping was not chosen."""
+    """More windows, which also have to pass the checks: with a displacement field, those of the homography's fit."""
     held_out_p95_px: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     refined_from: "Candidate | None" = None

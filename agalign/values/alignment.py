@@ -112,7 +112,7 @@ class JointResult:
     """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
     alone)."""
     model_family: ModelFamily
-    """Mapping that was fitted."""
+    """Kind of mapping that was fitted to the descriptors; windows may make it a homography."""
     last_step_px: Number
     """Movement of a corner in the last step."""
     corner_std_xy_px: Annotated[tuple[tuple[UpToInfinity, UpToInfinity], ...], Field(min_length=4, max_length=4)]

@@ -29,7 +29,8 @@ in common."""
 def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:
     """Return (n, 2, 4) the displacements by each shape at points (n, 2) of an image (width, height).
 
-    The shapes are radial of third and fifth order, and the two of decentring. Their length is 1 at the corners.
+    The shapes are radial of third and fifth order, of length 1 at the corners, and the two of decentring, of length 1
+    along their axis at the distance of the corners.
     """
     centre = (np.array(size_px, dtype=np.float64) - 1) / 2
     u, v = ((points_px - centre) / np.linalg.norm(centre)).T

@@ -27,9 +27,9 @@ MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
 _COMMON_ERROR_FACTOR = 12.0
 """Factor on the variance of a mapping where it is extrapolated: the errors that neighbouring windows and patches have
-in common average out between them only."""
+in common average out between them only. Assumed."""
 _FAR_SPACINGS = 3.0
-"""Window spacings, beyond the first, over which a mapping becomes an extrapolation."""
+"""Window spacings, beyond the first, over which a mapping becomes an extrapolation; assumed."""
 _GAP_SPACINGS = 2.0
 """Window spacings that are left out between windows that verify a relief: these are in every other field of a
 chessboard, whose sides are four spacings. The windows of the fit are in the other fields."""
