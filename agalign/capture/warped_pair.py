@@ -16,7 +16,7 @@ from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
 from agalign.verify.checks import AliasPeak, alias_peak, content_issues, repetition_issues
-from agalign.verify.coverage import points_in_frame, unobserved_quarters
+from agalign.verify.coverage import points_in_frame, points_in_mask, unobserved_quarters
 
 
 @dataclass(frozen=True)
@@ -104,5 +104,5 @@ class WarpedPair:
         Georeferenced rasters have areas without data, which do not count; the image of a camera is complete.
         """
         if self.pair.is_georeferenced:
-            return self.windows.visible_px(self.warped)
+            return points_in_mask(self.pair.fixed.valid & self.warped.valid)
         return points_in_frame(self.mapping, *self.pair.sizes_px)

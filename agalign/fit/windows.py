@@ -119,12 +119,6 @@ class FixedWindows:
         rows, shifts_px, sigma = map(np.concatenate, zip(*parts, strict=True))
         return Residual(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
 
-    def visible_px(self, moving: Raster) -> Points:
-        """Return the centres (n, 2) of the windows with enough pixels that are valid in both images."""
-        share = cv2.boxFilter((self.valid & moving.valid).astype(np.float32), -1, (self.side, self.side), anchor=(0, 0))
-        x, y = self.origins.T
-        return np.asarray(self.centres_px[share[y, x] >= self.min_valid])
-
     def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
         """Return (n, side, side) the windows with these origins, a copy."""
         if not len(origins):  # the image may be smaller than a window

@@ -25,6 +25,13 @@ def points_in_frame(mapping: PixelMapping, size_px: Size, moving_size_px: Size) 
     return points_px[_to_border_px(mapping(points_px), moving_size_px) >= 0]
 
 
+def points_in_mask(valid: Mask) -> Points:
+    """Return the points (n, 2) of a grid over an image at which a mask (height, width) is True."""
+    points_px = _cells((valid.shape[1], valid.shape[0]), *_LATTICE)
+    column, row = np.rint(points_px).astype(np.int64).T
+    return np.asarray(points_px[valid[row, column]])
+
+
 def pixels_in_frame(mapping: PixelMapping, size_px: Size, moving_size_px: Size) -> Mask:
     """Return the mask (height, width) of the pixels of the reference that are mapped into the moving image.
 

@@ -73,3 +73,14 @@ def test_smaller_windows_are_used_where_larger_ones_have_no_peak(monkeypatch: py
     assert WarpedPair.of(pair, pair.mapping(np.eye(3))).windows is pair.windows
     monkeypatch.setattr(pair.windows, "residuals", without_a_quarter)
     assert WarpedPair.of(pair, pair.mapping(np.eye(3))).windows is pair.reference.small_windows
+
+
+def test_the_common_area_of_georeferenced_files_has_their_pixels_without_texture() -> None:
+    fixed, moving = two_views(np.eye(3), 640, 480)
+    for image in (fixed, moving):
+        image.pixels[:, 320:] = image.pixels.mean()
+    valid = np.arange(640) >= 64
+    pair = pair_of(replace(fixed, valid=fixed.valid & valid), moving, {"geo": np.eye(3)})
+    common_px = WarpedPair.of(pair, pair.mapping(np.eye(3))).common_px()
+    assert 64 <= common_px[:, 0].min() < 100
+    assert common_px[:, 0].max() > 600
