@@ -326,15 +326,16 @@ def write_csv(scores: Sequence[Score] | Sequence[Scored], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([f.name for f in fields(scores[0])] if scores else [])
-        writer.writerows([_stored(v) for v in astuple(s)] for s in scores)
+        writer.writerows([_stored(f.name, v) for f, v in zip(fields(s), astuple(s), strict=True)] for s in scores)
 
 
-def _stored(value: object) -> object:
-    """A value in a cell of a file: a number with at most four decimals and five digits."""
+def _stored(name: str, value: object) -> object:
+    """A value in a cell of a file: a number with at most four decimals and digits, seconds with two and three."""
     if isinstance(value, bool):
         return int(value)
     if isinstance(value, float):
-        return "" if np.isnan(value) else f"{round(value, 4):.5g}"
+        decimals, digits = (2, 3) if name == "seconds" else (4, 4)
+        return "" if np.isnan(value) else f"{round(value, decimals):.{digits}g}"
     return value
 
 
