@@ -92,11 +92,13 @@ def band_tags(
 
 
 def _without_unset_clock(directory: Directory) -> Directory:
-    """The directory without the times of a clock that was not set, like `Capture.known_time`."""
-    dates = [directory[tag].data for tag in _TIMES if tag in directory and tag.name.startswith("DateTime")]
-    if all(is_clock_set(date.decode("latin-1")) for date in dates):
-        return directory
-    return {tag: entry for tag, entry in directory.items() if tag not in _TIMES}
+    """The directory without the dates of a clock that was not set, like `Capture.known_time`, and without their
+    fractions and time zones if no date is left.
+    """
+    dates = {tag for tag in _TIMES if tag in directory and tag.name.startswith("DateTime")}
+    unset = {tag for tag in dates if not is_clock_set(directory[tag].data.decode("latin-1"))}
+    removed = _TIMES if unset and unset == dates else unset
+    return {tag: entry for tag, entry in directory.items() if tag not in removed}
 
 
 def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:

@@ -8,13 +8,14 @@ import pytest
 import rasterio
 import tifffile
 from PIL import Image
+from PIL.ExifTags import Base
 
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import NAMESPACE, GridVignetting, vignetting_of
-from agalign.cameras.tag_transfer import band_tags
+from agalign.cameras.tag_transfer import _without_unset_clock, band_tags
 from agalign.cameras.tiff_directory import (
     EXIF,
     GPS,
@@ -191,3 +192,20 @@ def test_directories_that_follow_are_kept(tmp_path: Path) -> None:
     with tifffile.TiffFile(path) as tiff:
         assert len(tiff.pages) == 2
         np.testing.assert_array_equal(tiff.pages[1].asarray(), PIXELS + 1)
+
+
+ALL_TIMES = {Base.DateTimeOriginal, Base.DateTimeDigitized, Base.SubsecTimeOriginal}
+
+
+@pytest.mark.parametrize(
+    ("original", "digitised", "kept"),
+    [
+        ("2026:06:21 10:00:01", "0000:00:00 00:00:00", {Base.DateTimeOriginal, Base.SubsecTimeOriginal}),
+        ("1970:01:01 00:01:21", "1970:01:01 00:01:21", set()),
+        ("2026:06:21 10:00:01", "2026:06:21 10:00:01", ALL_TIMES),
+    ],
+)
+def test_only_dates_of_a_clock_that_was_not_set_are_removed(original: str, digitised: str, kept: set[int]) -> None:
+    times = {Base.DateTimeOriginal: text(original), Base.DateTimeDigitized: text(digitised)}
+    directory = {**times, Base.SubsecTimeOriginal: text("25"), Base.FNumber: text("2")}
+    assert set(_without_unset_clock(directory)) == kept | {Base.FNumber}
