@@ -90,7 +90,7 @@ def digest_of(packages: Sequence[str]) -> str:
             if file.is_file() and file.suffix != ".pyc":
                 found.update(file.relative_to(ROOT).as_posix().encode() + b"\0")
                 found.update(file.read_bytes().replace(b"\r\n", b"\n"))
-    return found.hexdigest()[:12]
+    return found.hexdigest()[:8]
 
 
 @dataclass(frozen=True)
