@@ -120,7 +120,7 @@ def table_row(folder: Path, rows: list[BandError]) -> TableRow:
     _, aligned, usable, overconfident, median, worst, p95, within, *_ = summary("", rows)
     heads = "aligned", "predicted, usable", "overconfident", "median error, px", "worst pair, px", "95th percentile, px"
     values = aligned.partition(" ")[0], usable, overconfident, median, worst, p95
-    cells = {**dict(zip(heads, values, strict=True)), "within 2 standard errors, %": within.rstrip("%")}
+    cells = {**dict(zip(heads, values, strict=True)), "within 2 expected errors, %": within.rstrip("%")}
     return TableRow("accuracy", title_of(folder), f"{len(rows)} pairs", cells)
 
 

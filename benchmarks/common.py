@@ -241,7 +241,7 @@ class BandError:
     part: BandResult
     """The band in it."""
     std_px: float
-    """Reported standard error; nan without one."""
+    """Expected error of the band; nan without one."""
     error_px: Points
     """(n,)"""
     claim_px: Points
@@ -351,4 +351,4 @@ def print_errors(groups: dict[str, list[BandError]]) -> None:
     for name, bands in groups.items():
         for b in bands:
             if b.median_px > WRONG_PX or b.part.status not in ("aligned", "predicted"):
-                print(f"{name}: {b.name}: {b.part.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")
+                print(f"{name}: {b.name}: {b.part.status}, {b.median_px:.2f} px, expected error {b.std_px:.2f}")

@@ -23,7 +23,7 @@ from common import BandError, Ties
 from figures_csv import FiguresOption, TableRow, title_of, write_figures
 from numpy.typing import NDArray
 
-USABLE = "standard error up to 1 px"
+USABLE = "expected error up to 1 px"
 """Bands that indices use by default."""
 
 
@@ -55,7 +55,7 @@ def table_row(name: str, bands: list[BandError], lost: int) -> TableRow:
     heads = "median error, px", "p95, px", "worst band, px"
     cells |= {head: f"{px:.2f}" for head, px in zip(heads, np.percentile(errors_px, (50, 95, 100)), strict=True)}
     within = [f"{np.mean(errors_px <= times * std_px):.0%}".rstrip("%") for times in (1, 2)]
-    cells |= dict(zip(("within 1 standard error, %", "within 2, %"), within, strict=True))
+    cells |= dict(zip(("within 1 expected error, %", "within 2, %"), within, strict=True))
     return TableRow("predicted bands", name, f"{lost} bands", cells)
 
 
