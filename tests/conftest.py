@@ -133,7 +133,7 @@ def write_signed(path: Path, text: str) -> None:
     path.write_text(json.dumps(json.loads(text) | {"checksum": content_checksum(text)}), encoding="utf-8")
 
 
-def save_known_model(path: Path, *, has_rig: bool = True) -> None:
+def save_known_model(path: Path, *, has_rig: bool = True, fingerprint: str = "") -> None:
     """Save a model with a rig that is learned from four captures at known heights."""
     from agalign.flight.groups import FlightCamera
     from agalign.flight.learn_rig import learn_rig
@@ -149,7 +149,7 @@ def save_known_model(path: Path, *, has_rig: bool = True) -> None:
     rig = learn_rig(captures, (640, 480), {}) if has_rig else None
     net = Descriptor("pseudo-siamese", (1, 1, 1), half_rectified=True, unit_length=True)
     camera = FlightCamera("Camera 7", (("Green", 640, 480), ("NIR", 640, 480), ("[Red]", 640, 480)))
-    save_model(FlightModel(net, camera, ("NIR", "[Red]"), {}, "", rig), path)
+    save_model(FlightModel(net, camera, ("NIR", "[Red]"), {}, fingerprint, rig), path)
 
 
 def write_band(path: Path, pixels: np.ndarray, **profile: object) -> None:

@@ -49,6 +49,8 @@ class EarlierResults:
         """Size, time and number of each file, and why it is not as it was written; None if it is."""
         self.file_states: dict[str, str] = {}
         """States in which runs left the files of each capture, by label (`records.listed_files`)."""
+        self.models: dict[Path, str] = {}
+        """Fingerprint of the model in each sidecar that is as it was written, by path; empty without a model."""
 
     def __call__(self, path: Path) -> tuple[Sidecar, Reason | None]:
         """Return a sidecar without its long tables, and why it is not as it was written (`read_with_change`).
@@ -64,6 +66,7 @@ class EarlierResults:
             return read_sidecar(path).without_tables(), known[1]
         sidecar, change = read_with_change(path)
         self._changes[path] = state, change
+        self.models[path] = "" if change else sidecar.model
         return sidecar.without_tables(), change
 
     def changed_files(self, label: str, folder: Path, parts: Sequence[FilePart]) -> list[FilePart]:

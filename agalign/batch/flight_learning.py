@@ -24,7 +24,6 @@ from agalign.batch.workers import RunTasks, in_order, serially
 from agalign.capture.by_rig import DELIVERED_STD_PX
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
-from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
@@ -57,7 +56,8 @@ def learn_flight(
     run_tasks: RunTasks = serially,
     threads: int = 1,
 ) -> FlightModel | None:
-    """Return a model learned from a few captures spread over the flight; None if none of them could be aligned.
+    """Return a model learned from a few captures spread over the flight, without its fingerprint; None if none of them
+    could be aligned.
 
     `run_tasks` processes single captures, and `threads` train the network; the result does not depend on them.
     `start` is an earlier model. It is returned if it still aligns captures of this flight as its rig predicts.
@@ -72,7 +72,6 @@ def learn_flight(
     times = sorted(c.known_time for c in captures if c.known_time)
     return replace(
         learned,
-        fingerprint=learning_fingerprint(captures, settings),
         folder=Path(os.path.commonpath([c.folder for c in captures])).as_posix(),
         captured_at=tuple(dict.fromkeys((times[0], times[-1]))) if times else (),
     )
@@ -90,7 +89,7 @@ class _FlightLearner:
     threads: int
 
     def learned(self) -> FlightModel | None:
-        """Return the model, without a fingerprint."""
+        """Return the model, without its times and folder."""
         if self.start is not None and self._holds(self.start):
             return self.start
         are_enough = len(self.captures) >= MIN_CAPTURES

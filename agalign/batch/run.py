@@ -16,13 +16,14 @@ from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
 from agalign.batch.earlier_results import EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
+from agalign.batch.model_files import ModelFiles
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.fingerprint import learning_fingerprint
-from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
+from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panel_readings import PanelReading
 from agalign.flight.rig import MIN_CAPTURES, Rig
@@ -200,8 +201,6 @@ class _Plan:
     """What remains to be done, by label, without the earlier results."""
     grids: dict[str, OutputGrid] = field(default_factory=dict)
     """Grids of the earlier results, whose sidecars of a season would not fit into memory."""
-    modelled: set[str] = field(default_factory=set)
-    """Captures whose earlier result used the network of the flight."""
 
     @property
     def number(self) -> int:
@@ -269,13 +268,11 @@ class _FlightRun:
 
     def selected(self) -> Selection:
         """Return what the run does with each capture. Raises ConfigurationError as `select_captures`, and for a file of
-        the user at the path of a model or of the picture of a panel.
+        the user at the path of the picture of a panel.
         """
         selection = select_captures(self.flight.captures, self.settings.write, self.options)
         for reading in selection.panels:
             refuse_foreign(panel_picture(reading.capture.label, self.out))
-        for name in model_names(flights_of(selection.captures)) if self.settings.learns_flights else ():
-            refuse_foreign(self.out / MODELS_FOLDER / name)
         return selection
 
     def remaining(self, capture: Capture) -> Remaining:
@@ -379,21 +376,19 @@ class _FlightRun:
             plan.left[capture.label] = replace(one, earlier=None)
             if (grid := self._earlier_grid(one)) is not None:
                 plan.grids[capture.label] = grid
-            if one.earlier and any(band.joint and band.joint.recipe == "flight" for band in one.earlier.bands):
-                plan.modelled.add(capture.label)
         return plan
 
     def _flights(self, plan: "_Plan", learn: Callable[..., FlightModel | None], record: RunPart) -> Iterator[_Flight]:
         """Yield the flights with the files of their models, which are learned where something needs them."""
-        groups = flights_of(plan.captures)
-        for group, name in zip(groups, model_names(groups), strict=True):
-            path = self.out / MODELS_FOLDER / name
-            model = path if _is_model(path) else None
+        files = ModelFiles(self.out)
+        for group in flights_of(plan.captures):
+            used = {self.results.models.get(CapturePaths.of(c, self.out).sidecar, "") for c in group} - {""}
+            path = files.find(group, used)
+            model = path if path is not None and _is_model(path) else None
             steps = {plan.left[c.label].step for c in group}
             # Without the model, which may be damaged or deleted, captures that are rendered get another crop.
-            is_lost = model is None and any(c.label in plan.modelled for c in group)
-            if "estimate" in steps or ("render" in steps and is_lost):
-                model = self._model(group, path, learn, record)
+            if "estimate" in steps or ("render" in steps and used and model is None):
+                model = self._model(group, path, files, learn, record)
             yield group, model
 
     def _renderings(
@@ -431,16 +426,26 @@ class _FlightRun:
         return left.earlier.output.grid if is_same else None
 
     def _model(
-        self, captures: Sequence[Capture], path: Path, learn: Callable[..., FlightModel | None], record: RunPart
+        self,
+        captures: Sequence[Capture],
+        earlier: Path | None,
+        files: ModelFiles,
+        learn: Callable[..., FlightModel | None],
+        record: RunPart,
     ) -> Path | None:
-        """Return the path of the flight's model, from this or an earlier run; None if no model could be learned."""
+        """Return the path of the flight's model, from this or an earlier run; None if no model could be learned.
+
+        `earlier` is the model by which captures of the flight were aligned.
+        """
         settings, given = self.settings, self.given
         if not settings.learns_flights:
             return None
-        if path.is_file():
-            with suppress(AgalignError):
-                if loaded_model(path, settings.joint.device).fingerprint == learning_fingerprint(captures, settings):
-                    return path
+        fingerprint = learning_fingerprint(captures, settings)
+        # A run that is stopped before its first capture leaves a model that no sidecar names.
+        path = files.find(captures, {fingerprint}) or earlier or files.new(captures)
+        with suppress(AgalignError):
+            if loaded_model(path, settings.joint.device).fingerprint == fingerprint:
+                return path
         began = time.monotonic()
         start = given if given is not None and is_flight_of(captures, given.camera) else None
         model = learn(captures, settings, lambda _stage, share: self.listener.on_learning(path.stem, share), start)
@@ -450,7 +455,8 @@ class _FlightRun:
         if model is None:
             return None
         with written_below(self.out):
-            save_model(model, path)
+            save_model(replace(model, fingerprint=fingerprint), path)
+        files.add(path, fingerprint)
         return path
 
 

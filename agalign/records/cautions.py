@@ -68,6 +68,15 @@ class Caution:
     """Label of the capture."""
 
 
+def models_in(out: Path) -> dict[Path, str]:
+    """Return the fingerprint of each model in OUT/models; files that cannot be read are left out."""
+    fingerprints = {}
+    for path in (out / MODELS_FOLDER).glob("*.safetensors"):
+        with suppress(InputError):
+            fingerprints[path] = model_fingerprint(path)
+    return fingerprints
+
+
 @dataclass(frozen=True)
 class RunFacts:
     """What the cautions about a capture depend on, other than its sidecar."""
@@ -82,12 +91,9 @@ class RunFacts:
     @classmethod
     def of(cls, out: Path) -> "RunFacts":
         """Read the facts of a run; files that cannot be read are left out."""
-        models, record, (panels, _) = set(), last_record(out), last_excluded(out)
-        for path in (out / MODELS_FOLDER).glob("*.safetensors"):
-            with suppress(InputError):
-                models.add(model_fingerprint(path))
+        models, record, (panels, _) = models_in(out), last_record(out), last_excluded(out)
         gone = frozenset[str]() if record is None else frozenset(part.capture for part in record.not_in_input)
-        return cls(tuple(p for p in panels if not p.fits_sensor), frozenset(models), gone)
+        return cls(tuple(p for p in panels if not p.fits_sensor), frozenset(models.values()), gone)
 
     def cautions(self, sidecar: Sidecar, label: str = "") -> Iterator[Caution]:
         """Yield the cautions about a capture, which are in the sidecar or follow from these facts."""

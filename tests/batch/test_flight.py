@@ -163,14 +163,6 @@ def test_a_lost_model_is_learned_again_for_captures_that_are_rendered(
     assert load_model(path, cpu).camera is not None
 
 
-def test_a_file_of_the_user_with_the_name_of_a_model_is_refused(flight: Path, aligned_copy: Path) -> None:
-    (path,) = (aligned_copy / "models").iterdir()
-    path.write_text("weights of mine")
-    with pytest.raises(agalign.ConfigurationError, match=f"{path.name}: was not written by agalign"):
-        run(flight, aligned_copy, options=RunOptions(overwrite=True))
-    assert path.read_text() == "weights of mine"
-
-
 def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_own(flight: Path) -> None:
     one, two = agalign.discover(flight).captures
 
