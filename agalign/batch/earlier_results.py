@@ -181,17 +181,17 @@ def _compared_files(earlier: Sidecar, capture: Capture) -> tuple[bool, list[str]
     leave out, whose file exists, is not lost.
     """
     changed, lost, here = set[str](), list[str](), {b.name: b for b in capture.bands}
+    root = capture.root or Path()  # files without a root have absolute paths
     samples, states, digests = input_samples(capture), input_states(capture), dict[str, str]()
     for part in earlier.bands:
-        name, file = part.band, Path(part.file).name
+        name = part.band
         if name not in here:
-            is_found = any((folder / file).exists() for folder in {b.path.parent for b in capture.bands})
             if reason := capture.unreadable_bands.get(name):
                 lost.append(reason.what)
-            elif name in capture.missing_bands or not is_found:
-                lost.append(f"{file} is missing")
+            elif name in capture.missing_bands or not (root / part.file).is_file():
+                lost.append(f"{part.file} is missing")
         elif name not in states:
-            lost.append(f"{file} cannot be read")
+            lost.append(f"{part.file} cannot be read")
         elif samples.get(name) != earlier.input_samples.get(name):
             changed.add(name)
         elif states[name] != earlier.input_states.get(name):

@@ -120,6 +120,23 @@ def test_a_choice_of_bands_is_no_loss_and_is_named(flight: Path, out: Path) -> N
     assert "2 finished captures to be estimated again; changed since: --reference\n" in done.stderr
 
 
+def test_files_of_bands_that_are_not_chosen_may_be_in_another_folder(copy: Path, tmp_path: Path) -> None:
+    """The halves of a dual camera write to a card each."""
+    other, out = copy / "other card", tmp_path / "out"
+    other.mkdir()
+    _, second = (p.rename(other / p.name) for p in sorted(copy.glob("*/*/IMG_*_4.tif")))
+    assert [len(r.result.bands) for r in agalign.align_folder(copy, out, settings=SEEDS)] == [5, 5]
+    # A file of the same name in the folder of other bands is another file.
+    shutil.copy(second, copy / FOLDER / second.name)
+    second.unlink()
+    chosen = agalign.DiscoverOptions(bands=("Green", "Red"))
+    reports = {r.label: r for r in agalign.align_folder(copy, out, settings=SEEDS, options=chosen)}
+    (done, kept) = (reports[(FOLDER / name).as_posix()] for name in ("IMG_0001", "IMG_0002"))
+    assert (done.state, done.problems) == ("done", ())
+    assert kept.state == "kept"
+    assert "other card/IMG_0002_4.tif is missing" in kept.problems[0]
+
+
 def test_a_band_that_other_captures_have_is_missing_when_a_capture_is_rendered_again(tmp_path: Path) -> None:
     folder, out = tmp_path / "in", tmp_path / "out"
     write_capture(folder, "green", "red")
