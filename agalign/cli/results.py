@@ -164,7 +164,7 @@ def _indices(
     """
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster
-    from agalign.errors import OutputError
+    from agalign.errors import OutputError, WorkerError
     from agalign.host.output_folder import locked
     from agalign.spectral_indices.formulas import chosen_indices
 
@@ -173,7 +173,7 @@ def _indices(
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
-    dask, unwritten = given["run"]["executor"], ""
+    dask, problem = given["run"]["executor"], ""
     reports: list[IndexReport] = []
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         try:
@@ -181,10 +181,10 @@ def _indices(
                 _print_capture(done, reports, terminal)
                 reports += done
                 show(number, done[0].capture, 0)
-        except OutputError as error:  # of the table or the report: the rasters and their statistics exist
-            unwritten = str(error)
+        except (OutputError, WorkerError) as error:  # the rasters that were reported, and their statistics, exist
+            problem = str(error)
     is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)
-    code = _conclude([one.name for one in chosen], reports, folder, terminal, unwritten, as_json=as_json)
+    code = _conclude([one.name for one in chosen], reports, folder, terminal, problem, as_json=as_json)
     return ExitCode.PARTIAL if is_unfinished and code == ExitCode.OK else code
 
 
@@ -193,16 +193,16 @@ def _conclude(
     reports: "Sequence[IndexReport]",
     folder: Path,
     terminal: Terminal,
-    unwritten: str = "",
+    problem: str = "",
     *,
     as_json: bool,
 ) -> int:
-    """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
-    not be written.
+    """Print the statistics of all indices, and return the exit code; `problem` says why captures are missing, or the
+    table or the report could not be written.
     """
     written = [r for r in reports if r.path is not None]
-    if unwritten:
-        terminal.problem(unwritten)
+    if problem:
+        terminal.problem(problem)
     if as_json:
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
@@ -214,9 +214,9 @@ def _conclude(
             first = f"{doubtful[0].capture} {doubtful[0].index}: {doubtful[0].problem}"
             rasters = counted(len(doubtful), "raster")
             terminal.problem(f"{rasters} with bands to check (column problem of {INDICES_FILE}), such as {first}")
-        if not unwritten:
+        if not problem:
             terminal.result(f"Statistics: {folder / INDICES_FILE}")
-    is_complete = len(written) == len(reports) and not unwritten
+    is_complete = len(written) == len(reports) and not problem
     return ExitCode.NOTHING if not written else ExitCode.OK if is_complete else ExitCode.PARTIAL
 
 

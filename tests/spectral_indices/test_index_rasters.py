@@ -2,8 +2,10 @@ import json
 import os
 import re
 import shutil
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from synthetic_flights.aligned import list_stack, make_aligned
 
 from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.errors import ConfigurationError, InputError, OutputError
+from agalign.errors import ConfigurationError, InputError, OutputError, WorkerError
 from agalign.rasters.band_reader import RAW
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import AlignedBand
@@ -427,6 +429,21 @@ def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
     assert report.kept
     listed = read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products
     assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
+
+
+def test_lost_workers_do_not_cost_the_finished_indices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_aligned(tmp_path, 2)
+
+    def lost_after_one(function: Any, tasks: Any) -> Iterator[Any]:
+        yield 0, partial(function, tasks[0])
+        raise WorkerError("the Dask scheduler does not answer any more")
+
+    monkeypatch.setattr(index_run, "open_workers", lambda *_, **__: nullcontext(lost_after_one))
+    done = agalign_here("indices", tmp_path, "--json")
+    assert done.returncode == 3
+    assert [one["capture"] for one in json.loads(done.stdout)["indices"]] == ["0000SET/IMG_0001"]
+    assert [row["capture"] for row in table_in(tmp_path / "indices.csv")] == ["IMG_0001"]
+    assert "the Dask scheduler does not answer any more\n" in done.stderr
 
 
 def test_an_index_that_cannot_be_written_does_not_cost_the_others(
