@@ -58,7 +58,9 @@ def index_tasks(
     """
     if not indices:
         raise ConfigurationError("no index is given; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
-    if target != out:
+    if target.resolve() == out.resolve():
+        target = out  # also if it is spelled differently, or is a link
+    else:
         refuse_foreign_table(target)
     sidecars = counted_sidecars(run_sidecars(out), out)
     task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, RunFacts.of(out))

@@ -431,6 +431,21 @@ def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
     assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
 
 
+def test_the_output_folder_of_the_run_may_be_spelled_differently(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its sidecars list the rasters, and its report shows them."""
+    make_aligned(tmp_path / "out", 1)
+    write_pages(tmp_path / "out", pytest.fail)
+    monkeypatch.chdir(tmp_path)
+    for target, formula in ((Path("out"), "a=N-R"), (tmp_path / "out", "a=N+R"), (tmp_path / "out", "b=N-R")):
+        assert agalign_here("indices", "out", "-o", target, "--formula", formula).returncode == 0
+        assert agalign_here("verify", "out").returncode == 0
+    listed = [part.file for part in read_sidecar(tmp_path / "out" / "0000SET" / "IMG_0001.json").products]
+    assert {"IMG_0001_a.tif", "IMG_0001_b.tif"} <= {*listed}
+    assert "IMG_0001_b.png" in (tmp_path / "out" / "index.html").read_text()
+
+
 def test_lost_workers_do_not_cost_the_finished_indices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_aligned(tmp_path, 2)
 
