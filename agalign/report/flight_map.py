@@ -6,6 +6,7 @@ It is a view of the sidecars, and of the captures of panels and of the sky that 
 import json
 from collections import defaultdict
 from collections.abc import Iterable
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -75,15 +76,16 @@ class FlightMap:
         for label, files in rasters.items():
             self._features[label]["properties"]["indices"] = files
 
-    def write(self, out: Path) -> Path | None:
-        """Write the file atomically and return it; None if no capture has a position. Raises OutputError."""
+    def write(self, out: Path) -> None:
+        """Write the file atomically; remove that of an earlier run if no capture has a position. Raises OutputError."""
         features = [self._features[label] for label in sorted(self._features)]
         if not any(f["geometry"] for f in features):
-            return None
+            with suppress(OSError):
+                (out / FLIGHT_MAP_FILE).unlink(missing_ok=True)
+            return
         lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
         text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
         write_text(out / FLIGHT_MAP_FILE, text)
-        return out / FLIGHT_MAP_FILE
 
 
 def _feature(label: str, shape: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:

@@ -155,7 +155,9 @@ def outdate_pages(out: Path) -> None:
 
 
 def pages_exist(out: Path) -> bool:
-    """Return True if the pages of an earlier run are complete and newer than all files that they describe."""
+    """Return True if report and summary of an earlier run exist and are newer than all files that they describe. Tables
+    and maps that not every run has are not looked for.
+    """
     try:
         written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
         entries = [*find_sidecars(out), *(out / f for f in (PANELS_FILE, SKY_FILE) if (out / f).exists())]
