@@ -27,7 +27,7 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.exports.programs import ExportReport
 from agalign.exports.programs import export as export_run
-from agalign.host.output_folder import locked, prepare_output
+from agalign.host.output_folder import locked
 from agalign.host.processes import end_if_reimported
 from agalign.pixels.masks import raster_of
 from agalign.records.sidecar_file import check_products
@@ -225,7 +225,7 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
         The capture lacks the tags or bands that a setting needs (such as those for radiance), or `out` contains the
         result of a different capture with the same name.
     OutputError
-        A file cannot be written.
+        A file cannot be written, or another run writes to `out`.
 
     Examples
     --------
@@ -240,9 +240,9 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     if not selection.captures:
         what = "the sky" if selection.sky else "a calibration panel"
         raise InputError(f"{capture.label}: shows {what}; align another capture, or all with align_panels=True")
-    prepare_output(Path(out))
-    refuse_results_elsewhere(selection.captures, Path(out))
-    return process_capture(Task(selection.captures[0], Path(out), settings))
+    with locked(Path(out)):
+        refuse_results_elsewhere(selection.captures, Path(out))
+        return process_capture(Task(selection.captures[0], Path(out), settings))
 
 
 @checked

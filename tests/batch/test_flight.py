@@ -271,6 +271,8 @@ def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
     next(first)
     with pytest.raises(agalign.OutputError, match="another run writes there"):
         run(flight, tmp_path, seeded())
+    with pytest.raises(agalign.OutputError, match="another run writes there"):
+        agalign.align_capture(agalign.discover(flight).captures[1], tmp_path, settings=seeded())
     first.close()
     assert read_run_record(tmp_path).state == "interrupted"
     assert "kept" in states(run(flight, tmp_path, seeded()))
