@@ -4,7 +4,8 @@ python examples/compare_pair.py FIXED MOVING [TIES.csv [HOMOGRAPHY.txt]]
 
 TIES.csv has the columns fixed_x, fixed_y, moving_x, moving_y: raw pixels, x right, y down, (0, 0) is the centre of the
 top-left pixel. Without it, the script prints how far each method is from agalign. HOMOGRAPHY.txt has 3 x 3 numbers: the
-mapping from FIXED to MOVING by another method. FIXED and MOVING have one band each.
+mapping from FIXED to MOVING by another method. FIXED and MOVING have one band each. agalign accepts a pair with the
+status `aligned`; one that is `failed` has no mapping.
 """
 
 import sys
@@ -19,6 +20,8 @@ def by_sift(fixed, moving):
     """Return the homography (3, 3) of MAGSAC++ from SIFT matches, or None."""
     sift = cv2.SIFT.create(5000, enable_precise_upscale=True)  # without it, key points are off by 0.25 px
     (points, found), (others, theirs) = (sift.detectAndCompute(image, None) for image in (fixed, moving))
+    if found is None or theirs is None:  # no key point
+        return None
     matches = cv2.BFMatcher().knnMatch(found, theirs, k=2)
     good = [match[0] for match in matches if len(match) == 2 and match[0].distance < 0.8 * match[1].distance]
     if len(good) < 4:
@@ -50,6 +53,10 @@ if len(sys.argv) not in (3, 4, 5):
 fixed, moving = (cv2.imread(name, cv2.IMREAD_UNCHANGED) for name in sys.argv[1:3])
 grey = [cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U) for image in (fixed, moving)]
 result = agalign.align(fixed, moving)
+if result.status == "failed":
+    print(f"agalign, failed: {result.reason}")
+    if len(sys.argv) == 3:
+        sys.exit("nothing to compare with; give TIES.csv")
 matrices = {"SIFT": by_sift(*grey), "ECC": by_ecc(*grey)}
 
 if len(sys.argv) == 5:
@@ -61,7 +68,7 @@ else:
     x, y = np.meshgrid(np.linspace(0, fixed.shape[1] - 1, 33), np.linspace(0, fixed.shape[0] - 1, 25))
     points = np.column_stack([x.ravel(), y.ravel()])
     truth, what = result.map(points), "distance from agalign"
-mapped = {f"agalign, {result.status}": result.map(points)}  # only `aligned` is accepted
+mapped = {} if result.status == "failed" else {f"agalign, {result.status}": result.map(points)}
 for name, matrix in matrices.items():
     mapped[name] = None if matrix is None else cv2.perspectiveTransform(points[None], matrix)[0]
 for name, positions in mapped.items():
@@ -70,4 +77,5 @@ for name, positions in mapped.items():
         continue
     error_px = np.linalg.norm(positions - truth, axis=1)
     print(f"{name}: median {what} {np.median(error_px):.3f} px, beyond 1 px {np.mean(error_px > 1):.1%}")
-print(f"expected error by agalign: {result.std_px:.3f} px (RMS)")
+if result.status in ("aligned", "predicted"):
+    print(f"expected error by agalign: {result.std_px:.3f} px (RMS)")

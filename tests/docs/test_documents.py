@@ -433,6 +433,22 @@ def test_the_example_has_the_matrices_of_opencv_and_micasense(desk: Path, monkey
     assert np.corrcoef(nir_on_green[valid], expected[valid])[0, 1] > 0.95
 
 
+@pytest.mark.slow
+def test_a_pair_that_cannot_be_aligned_has_no_error(
+    originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("blank.tif", np.full((200, 240), 100, np.uint8))
+    arguments = ["compare_pair.py", str(originals / "green.tif"), "blank.tif"]
+    monkeypatch.setattr(sys, "argv", [*arguments, str(originals / "ties.csv")])
+    runpy.run_path(str(ROOT / "examples" / "compare_pair.py"))
+    reason = "agalign, failed: the moving band is constant or all invalid"
+    assert capsys.readouterr().out.splitlines() == [reason, "SIFT: no mapping", "ECC: no mapping"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit, match="nothing to compare with"):
+        runpy.run_path(str(ROOT / "examples" / "compare_pair.py"))
+
+
 def test_every_block_has_a_kind() -> None:
     """One without a kind would not be run."""
     assert [block.where for page in PAGES for block in blocks_of(page) if block.kind not in KINDS] == []
