@@ -2,8 +2,9 @@
 
 python examples/training_tiles.py OUT
 
-All bands have the pixels of the reference, so one label raster fits all of them: draw it over `<capture>.tif`, and save
-it as `<capture>.labels.tif`. In a loss per pixel, use `usable.all(0)`.
+OUT has stacks and quality flags (`--layout stack`, `--qa`). All bands have the pixels of the reference, so one label
+raster fits all of them: draw it over `<capture>.tif`, save it as `<capture>.labels.tif`, and read it by
+`Tiles(stacks, labels=True)`. In a loss per pixel, use `usable.all(0)`.
 
 Neighbouring captures overlap: the split is by position, and no capture for validation has ground of one for training.
 That needs the footprints of `OUT/flight.geojson` (GPS position, altitude, yaw and focal length in the tags). With
@@ -19,18 +20,21 @@ import rasterio
 import torch
 from rasterio.windows import Window
 
-MASKED = 847
-"""All quality flags except `predicted` (16) and `error_over_half_px` (32), as `agalign indices --mask-qa` masks."""
+MASKED = 863
+"""All quality flags except `error_over_half_px` (32): bands of blur and noise are `predicted` (16). 847 keeps them, as
+`agalign indices --mask-qa` does.
+"""
 
 
 class Tiles(torch.utils.data.Dataset):
-    """Tiles of stacks: pixels (float32) and usable pixels (bool), each (bands, side, side), in the order of the bands.
+    """Tiles of stacks: pixels (float32) and usable pixels (bool), each (bands, side, side), in the order of the bands;
+    with `labels` also those (int64), (side, side).
 
     All stacks of a camera have the same bands. Narrower rests at the right and lower edges are dropped.
     """
 
-    def __init__(self, stacks, side_px=256):
-        self.tiles = []
+    def __init__(self, stacks, side_px=256, labels=False):
+        self.tiles, self.labels = [], labels
         for path in stacks:
             with rasterio.open(path) as stack:
                 corners = np.ndindex(stack.height // side_px, stack.width // side_px)
@@ -44,8 +48,11 @@ class Tiles(torch.utils.data.Dataset):
         with rasterio.open(path) as stack, rasterio.open(path.with_suffix(".qa.tif")) as quality:
             bands = stack.read(window=window).astype("float32")
             flags = quality.read(range(2, quality.count + 1), window=window)
-        usable = (flags & MASKED) == 0
-        return np.nan_to_num(bands), usable & np.isfinite(bands)
+        usable = ((flags & MASKED) == 0) & np.isfinite(bands)
+        if not self.labels:
+            return np.nan_to_num(bands), usable
+        with rasterio.open(path.with_suffix(".labels.tif")) as file:
+            return np.nan_to_num(bands), usable, file.read(1, window=window).astype("int64")
 
 
 def box(feature):
@@ -90,5 +97,5 @@ if __name__ == "__main__":
     training, validation = Tiles(training), Tiles(validation)
     print(f"{len(training)} tiles for training, {len(validation)} for validation")
     for bands, usable in torch.utils.data.DataLoader(training, batch_size=8):
-        loss = ((bands - bands.mean()) ** 2 * usable).sum() / usable.sum()
+        loss = ((bands - bands.mean()) ** 2 * usable).sum() / usable.sum().clamp(min=1)
         print(f"{tuple(bands.shape)}: {float(loss):.3g}")

@@ -345,6 +345,21 @@ def test_the_tiles_for_validation_show_no_ground_of_those_for_training() -> None
         box({"id": "IMG_0001", "geometry": {"type": "Point", "coordinates": [5, 52]}})
 
 
+def test_tiles_have_labels_and_no_predicted_bands(tmp_path: Path) -> None:
+    names = runpy.run_path(str(ROOT / "examples" / "training_tiles.py"))
+    bands, labels = np.ones((2, 16, 24), np.float32), np.arange(16 * 24, dtype=np.uint16).reshape(1, 16, 24)
+    flags = np.zeros((3, 16, 24), np.uint16)
+    bands[0, 0, 0], flags[2, :, 8:] = np.nan, 16  # nodata, predicted
+    for suffix, pixels in (("", bands), (".qa", flags), (".labels", labels)):
+        write_band(tmp_path / f"IMG_0001{suffix}.tif", pixels)
+    tiles = names["Tiles"]([tmp_path / "IMG_0001.tif"], side_px=8, labels=True)
+    assert len(tiles) == 6
+    pixels, usable, own = tiles[1]
+    assert (pixels.shape, usable[0].all(), usable[1].any()) == ((2, 8, 8), True, False)
+    np.testing.assert_array_equal(own, labels[0, :8, 8:16])
+    assert (tiles[0][0][0, 0, 0], tiles[0][1].sum()) == (0.0, 2 * 64 - 1)
+
+
 def test_captures_that_overlap_make_no_data_set(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
