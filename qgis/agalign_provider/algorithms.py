@@ -76,7 +76,7 @@ class AgalignAlgorithm(QgsProcessingAlgorithm):
                 feedback.pushWarning(event.get("message", ""))
             elif kind == "text":
                 feedback.pushInfo(event["message"])
-            elif kind == "learnt":
+            elif kind == "learned":
                 feedback.pushInfo("{}: learned in {} s".format(event["camera"], event["seconds"]))
             elif kind in _FINISHED or kind == "index":
                 done += 1

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -35,6 +36,14 @@ def test_only_readable_sidecars_are_listed(tmp_path: Path) -> None:
     (tmp_path / "b.json").write_text("[" * 100_000)
     os.mkfifo(tmp_path / "c.json")
     assert [path.name for path, _ in command.sidecars_below(tmp_path)] == ["a.json"]
+
+
+def test_events_that_the_plugin_shows_are_those_of_the_program() -> None:
+    listener = (PLUGIN / "algorithms.py").read_text(encoding="utf-8").partition("def on_event")[2].partition("def ")[0]
+    shown = set(re.findall(r'kind == "(\w+)"', listener))
+    program = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "agalign" / "cli").glob("*.py"))
+    assert "found" in shown
+    assert shown - {"text"} <= set(re.findall(r'event\(\s*"(\w+)"', program))  # `text` is a line that is no event
 
 
 def test_executable_of_the_setting_or_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
