@@ -407,7 +407,8 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
         raise InputError(f"its bands are in different units ({', '.join(sorted(units))})")
     (unit,) = units
     if not (index.any_unit or index.is_of_user) and unit != "reflectance":
-        raise InputError(f"needs reflectance, and the bands are {unit}; align with --radiometry")
+        remedy = "a calibration panel gives it" if unit == "relative reflectance" else "align with --radiometry"
+        raise InputError(f"needs reflectance, and the bands are {unit}; {remedy}")
     return unit
 
 

@@ -119,12 +119,15 @@ def test_indices_of_the_synthetic_flight_are_its_truth(tmp_path: Path) -> None:
 
 def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
-    for band, index, problem in (
-        ("NIR", "ndvi", "different units"),
-        ("Red", "savi", "needs reflectance, and the bands are radiance"),
+    relative = "relative reflectance"
+    for bands, quantity, index, problem in (
+        (("NIR",), "radiance", "ndvi", "different units"),
+        (("Red",), "radiance", "savi", "needs reflectance, and the bands are radiance; align with --radiometry"),
+        (("Red", "NIR"), relative, "savi", f"needs reflectance, and the bands are {relative}; a calibration panel"),
     ):
         with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif", "r+") as dataset:
-            dataset.update_tags(dataset.descriptions.index(band) + 1, QUANTITY="radiance")
+            for band in bands:
+                dataset.update_tags(dataset.descriptions.index(band) + 1, QUANTITY=quantity)
         list_stack(tmp_path / "0000SET" / "IMG_0001.json")
         assert problem in indices_of(tmp_path, index)[0].problem
 
