@@ -11,7 +11,7 @@ class Term(NamedTuple):
 
 
 TERMS: dict[str, Term] = {
-    "ok": Term("ok", "capture: all bands exist, and the image of each band confirms that it is aligned"),
+    "ok": Term("ok", "capture: all bands exist, from complete files, and are aligned"),
     "ok_by_prediction": Term(
         "ok by prediction",
         "capture: indices can use all bands, but at least one is predicted: its own image does not confirm it",
@@ -20,7 +20,10 @@ TERMS: dict[str, Term] = {
         "degraded, failed",
         "capture. degraded: a band is missing, incomplete, or too uncertain for indices. failed: all bands failed",
     ),
-    "aligned": Term("aligned", "band: its own image determines the mapping, and all independent checks confirm it"),
+    "aligned": Term(
+        "aligned",
+        "band: its own image determines the mapping and all checks confirm it, or it shares the reference's lens",
+    ),
     "predicted": Term(
         "predicted",
         "band: its image does not determine the whole mapping (water, blur, parallax seen by only two lenses). Other "
@@ -50,10 +53,10 @@ TERMS: dict[str, Term] = {
     ),
     "residual": Term(
         "residual",
-        "shift between band and reference that windows measure after alignment, independently of the estimation: "
-        "median and 95th percentile (p95) of its length, px; noise 0.02 to 0.05 px. It is known only where there "
-        "is texture; the expected error is about the whole image. Below 0.5 px it is not visible in an index of single "
-        "plants",
+        "shift between band and reference that windows measure after alignment, each under a mapping that was fitted "
+        "without it: median and 95th percentile (p95) of its length, px; noise 0.02 to 0.05 px. It is known only where "
+        "there is texture; the expected error is about the whole image. Below 0.5 px it is not visible in an index of "
+        "single plants",
     ),
     "coverage": Term("windows measured", "share of the windows with texture in which a shift could be measured"),
     "seed": Term(
