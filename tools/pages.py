@@ -151,7 +151,7 @@ NOT_LISTED = {
     *("loss", "chance", "iterations", "levels", "last_step_px", "cells"),
     *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
     *("score", "peak_sigma", "trusted", "runner_up_sigma", "windows", "held_out_p95_px"),
-    *("joint", "rig_std_px", "field_std_px", "input_digests", "input_states", "bytes", "sha256"),
+    *("joint", "rig_std_px", "field_std_px", "input_digests", "input_states"),
     *("vignetting_corrected", "exposed_after_s", "not_written", "seconds"),
 }
 """Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""

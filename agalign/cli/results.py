@@ -77,7 +77,11 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
 
 
 def _verify(terminal: Terminal, out: Out) -> int:
-    """Compare the files of a run with their checksums."""
+    """Compare the files of a run with their checksums.
+
+    Compares each sidecar and the files that it lists (rasters, pictures, tie points), and prints those that are missing
+    or have changed; the exit code is then 3. Tables, report, models and input images are not compared.
+    """
     from agalign.records.run_record import counted_sidecars
     from agalign.records.sidecar_file import label_of, run_sidecars, verify_outputs
 
