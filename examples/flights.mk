@@ -15,7 +15,7 @@ MAKEFLAGS += --keep-going
 
 all: $(DONE)
 
-# Exit code 3 is a finished flight in which some bands are not aligned: its name is kept, and make continues.
+# Exit code 3 is a finished flight that must be checked: its name is kept, and make continues.
 $(OUT)/%.done: $(FLIGHTS)/%/
 	@mkdir -p $(OUT)
 	agalign $< -o $(OUT)/$* $(OPTIONS); code=$$?; \

@@ -8,7 +8,7 @@
 # Activate the environment of agalign first. A task that SLURM kills leaves no lock: submit it again, and it resumes.
 #
 #SBATCH --cpus-per-task=4
-#SBATCH --mem=12G
+#SBATCH --mem=12G  # twice the memory of 4 jobs with images of 12 megapixels
 #SBATCH --time=04:00:00
 #SBATCH --requeue
 set -uo pipefail
@@ -26,5 +26,5 @@ case $code in
     0) ;;
     3) echo "$name" >> "$OUT/incomplete.txt" ;;  # finished: check OUT/<flight>/index.html
     143) exec scontrol requeue "$SLURM_JOB_ID" ;;  # stopped at the time limit: the same command resumes the run
-    *) exit "$code" ;;  # 1: nothing could be processed, 2: wrong options
+    *) exit "$code" ;;  # 1: nothing could be processed, or no NDVI; 2: wrong options
 esac
