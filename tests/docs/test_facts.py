@@ -36,7 +36,7 @@ from .blocks import PAGES, ROOT, each_page, text_of
 
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
-    *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
+    *("--cpus", "--gpus", "--memory", "--read-only", "--tmpfs", "--user"),  # docker run
     *("--data", "--faults", "--floor", "--grids", "--kills", "--kinds", "--pairs", "--plot"),  # benchmarks
     *("--ranges", "--scenes", "--size"),
     *("--extra-index-url", "--index-url", "--strict"),  # pip, mypy
@@ -45,7 +45,7 @@ OPTIONS_OF_OTHERS = {
 """Options in the text of pages that are not those of agalign."""
 WORDS_OF_A_MESSAGE = 4
 """Code of as many words is a quoted message, if it is none of these."""
-NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|rio|docker|sphinx-build|if __name__) |--|x ↦")
+NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|rio|docker|grep|sphinx-build|if __name__) |--|x ↦")
 
 
 def code_in(page: Path) -> list[str]:
