@@ -71,6 +71,16 @@ def test_a_mosaic_is_aligned_to_the_grid_of_another(mosaics: Path, tmp_path: Pat
             np.testing.assert_array_equal(out.read(), turned.read())
 
 
+def test_coordinates_may_be_off_by_most_of_a_mosaic(mosaics: Path, tmp_path: Path) -> None:
+    """By the coordinates, summer is 41 m east of where its image is, of 64 m."""
+    with rasterio.open(mosaics / "summer.tif") as source:
+        away = {**source.profile, "transform": Affine.translation(37, 0) * source.transform}
+        write_band(tmp_path / "summer.tif", source.read(), **away)
+    assert onto(mosaics, tmp_path / "summer.tif", tmp_path / "out").returncode == 0
+    result = np.array(read_json(tmp_path / "out" / "summer.json")["bands"][1]["homography"]["fixed_to_moving"])
+    assert geometry.corner_error_px(result, TRUTH, 640, 520) < 0.3
+
+
 def test_colours_and_indices_are_of_one_date(mosaics: Path, tmp_path: Path) -> None:
     """The red of the reference is first in the output."""
     assert agalign_here("indices", mosaics / "out", "--index", "ndvi", "-o", tmp_path).returncode == 0
