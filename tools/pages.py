@@ -152,7 +152,7 @@ NOT_LISTED = {
     *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
     *("score", "peak_sigma", "trusted", "runner_up_sigma", "windows", "held_out_p95_px"),
     *("joint", "rig_std_px", "field_std_px", "input_digests", "input_states"),
-    *("vignetting_corrected", "exposed_after_s", "not_written", "seconds"),
+    *("vignetting_corrected", "exposed_after_s", "not_written", "seconds", "cell_means", "lens_calibration"),
 }
 """Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""
 
@@ -237,7 +237,7 @@ def indices() -> str:
     rows = [("index", "formula", "bands", "source")]
     for index in INDICES.values():
         unit = "any unit" if index.any_unit else "reflectance"
-        rows.append((index.name, f"`{index.formula}`", unit, index.source))
+        rows.append((index.name, f"`{index.formula.replace(' ', '')}`", unit, index.source))
     return table(rows) + "\n"
 
 

@@ -210,9 +210,7 @@ def _check_lengths(*lists: NDArray[np.float64]) -> None:
 
 
 class ErrorPart(_Part):
-    """What the expected error of a mapping is made of, px of the reference. The shifts of `metrics.windows` and the
-    standard error of the parallax are parts of it too.
-    """
+    """Parts of the expected error of a mapping, px of the reference, beside those of windows and parallax."""
 
     std_px: Number4
     """Expected error of the band: its RMS over the area that both images show, without the shifts of `moved`."""
@@ -325,9 +323,9 @@ class BandResult(_Part):
     saturated: Number4 | None = None
     """Share of saturated pixels in the file."""
     missing_rows: int = 0
-    """Rows at the end of the file without pixels, as an incomplete transfer leaves them; they are nodata."""
+    """Rows at the end of an incomplete file without pixels; they are nodata."""
     share_over_1_px: Number4 | None = None
-    """Share of the pixels of the output whose expected error exceeds 1 px of the reference or is unknown."""
+    """Share of the output's pixels whose expected error exceeds 1 px of the reference or is unknown."""
     moved_share: Number4 | None = None
     """Share of the pixels of the output in areas that moved."""
     seconds: Number3
