@@ -7,7 +7,7 @@ from functools import partial
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_descriptors import by_descriptors
-from agalign.capture.by_relief import ReliefCandidates, by_relief
+from agalign.capture.by_relief import UnderRelief, by_relief
 from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, bands_to_learn, observed, rig_predictions
 from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is_extrapolated, spreads_of_relief_px
 from agalign.capture.candidate import BandCandidates, RefinedBand
@@ -126,8 +126,8 @@ class CaptureEstimation:
     """True while a flight is learned: residual lens distortion is fitted to all its captures together."""
     bands: dict[str, BandCandidates] = field(default_factory=dict)
     """What was found, by band."""
-    reliefs: list[ReliefCandidates] = field(default_factory=list)
-    """What was found under the reliefs of the capture."""
+    reliefs: list[UnderRelief] = field(default_factory=list)
+    """The candidates under each relief that fits the capture."""
 
     def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True) -> Alignments:
         """Take all steps; return the alignments.
@@ -245,7 +245,7 @@ class CaptureEstimation:
             is_wanted = band.pair.is_reduced and band.accepted and result[name].mapping.parallax is None
             if not is_wanted or result[name].status != "aligned":
                 continue
-            refined = at_full_resolution(capture.reference, band, band.accepted[-1])
+            refined = at_full_resolution(capture.reference, band.accepted[-1])
             if isinstance(refined, Issue):
                 band.issue, band.candidates = refined, []
             elif refined is not None:
@@ -277,8 +277,7 @@ class CaptureEstimation:
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
         reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
         self.reliefs += reliefs
-        fitting = [set(relief.candidates) for relief in self.reliefs if relief.fits_better]
-        under = set.intersection(*fitting) if fitting else set()  # whichever of them is chosen
+        under = set.intersection(*map(set, self.reliefs)) if self.reliefs else set()  # whichever of them is chosen
         new = {pair.name for pair, _ in starts} | {name for name, band in self.bands.items() if not band.candidates}
         for band in bands:
             name = band.pair.name

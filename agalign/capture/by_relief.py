@@ -1,12 +1,13 @@
 """Candidates under the relief of a capture, a geometry of all its bands that is compared with their homographies.
 
-A relief that was estimated without a band verifies the band, in windows that took no part in the fit of planes and
-baselines: with few bands the relief of all others, else that of half of the bands. A band that the relief of the others
-does not explain, as it was exposed at another time or is noisy, gets a homography and a baseline of its own under that
-relief. Either all bands with the same reference image use the relief, or none: bands of much lower resolution have
-another one.
+It is estimated if the residuals of the homographies have parallax in common. A relief that was estimated without a
+band verifies the band, in windows that took no part in the fit of planes and baselines: with few bands the relief of
+all others, else that of half of the bands. A band that the relief of the others does not explain, as it was exposed at
+another time or is noisy, gets a homography and a baseline of its own under that relief. Either all bands with the same
+reference image use the relief, or none: bands of much lower resolution have another one.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,21 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate, RefinedBand, mapping_error
-from agalign.capture.common_parallax import (
-    MIN_BANDS,
-    MIN_PARALLAX_PX,
-    common_parallax_px,
-    consistent_bands,
-    layout_of,
-    parallax_groups,
-)
-from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.window_fit import (
+    Adjustment,
     BaselinePrior,
     WindowFit,
     WindowShifts,
@@ -50,27 +44,23 @@ from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual, decrease_in_standard_errors, lengths_in_common_px
 from agalign.verify.checks import BY_PARALLAX, MAX_SHIFT_PX
 
+MIN_PARALLAX_PX = 0.3
+"""Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
+_MIN_BANDS = 2
+"""Minimum number of moving lenses: a relief is verified with the other lenses."""
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
 with booms and plants at 1 m."""
 
-
-@dataclass(frozen=True)
-class ReliefCandidates:
-    """The candidates of the bands of a capture under one relief."""
-
-    reference: Reference
-    """The reference image that they have in common."""
-    candidates: Mapping[str, Candidate]
-    """By band."""
-    fits_better: bool
-    """The relief fits half of the bands better than their homographies, by held-out windows."""
+UnderRelief = Mapping[str, Candidate]
+"""The candidates of the bands with one reference image under one relief, by band."""
 
 
 def by_relief(
     bands: Sequence[RefinedBand], use: ReliefUse, *, is_observation: bool = False
-) -> tuple[list[ReliefCandidates], set[str]]:
-    """Return the candidates under the reliefs of a capture, with lens shapes where no rig contains the distortion.
+) -> tuple[list[UnderRelief], set[str]]:
+    """Return the candidates under the reliefs that fit half of the bands better than their homographies, by held-out
+    windows, with lens shapes where no rig contains the distortion.
 
     Bands with different kinds of lens models determine a relief each. Also return the names of bands with common
     displacements along a line, which neither a relief nor displacement fields must follow.
@@ -78,18 +68,18 @@ def by_relief(
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter, and the parallax of windows suffices.
     """
-    result: list[ReliefCandidates] = []
+    reliefs: list[UnderRelief] = []
     along_a_line: set[str] = set()
     if use == "never":
-        return result, along_a_line
+        return reliefs, along_a_line
     # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
     # would follow them too.
     max_line_px = 1.0
     with_relief: list[list[RefinedBand]] = []
-    for group in parallax_groups(bands):
-        if len(group) < MIN_BANDS:
+    for group in _parallax_groups(bands):
+        if len(group) < _MIN_BANDS:
             continue
-        parallax_px, on_a_line = common_parallax_px(group)
+        parallax_px, on_a_line = _common_parallax_px(group)
         if on_a_line and parallax_px > max_line_px:
             along_a_line |= {band.pair.name for band in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
@@ -97,9 +87,93 @@ def by_relief(
     others = [band for band in bands if band.pair.name not in along_a_line]
     for group in with_relief:
         with suppress(GeometryError):
-            relief = _observed(group) if is_observation else _of_group(group, others)
-            result += [] if relief is None else [relief]
-    return result, along_a_line
+            under = _observed(group) if is_observation else _of_group(group, others)
+            reliefs += [under] if under else []
+    return reliefs, along_a_line
+
+
+def _parallax_groups(bands: Sequence[RefinedBand]) -> list[list[RefinedBand]]:
+    """Group the bands by reference image and space of the homographies; sharp ones only, if these are enough.
+
+    Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
+    """
+    groups: dict[tuple[int, str], list[RefinedBand]] = {}
+    for band in bands:
+        pair, residual = band.pair, band.warped.residual
+        is_reliable = band.joint.is_retrieved and len(residual.measured_px) >= MIN_WINDOWS
+        if is_reliable and not pair.is_coarse:
+            groups.setdefault((id(pair.reference), pair.space), []).append(band)
+    sharp = [[b for b in group if not b.pair.is_blurred] for group in groups.values()]
+    return [some if len(some) >= _MIN_BANDS else group for some, group in zip(sharp, groups.values(), strict=True)]
+
+
+def _common_parallax_px(group: Sequence[RefinedBand]) -> tuple[float, bool]:
+    """Return the p95 of the parallax that is common to the bands, 0 if there is none, and if the baselines are on one
+    line without tags that confirm them.
+    """
+    residuals = _common_residuals(group)
+    # The p95 is robust, as a wrong peak is no parallax.
+    if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
+        return 0.0, False
+    windows = WindowShifts.of(residuals, [band.warped.mapping for band in group])
+    consistent = _consistent_bands(windows, group)
+    if consistent is None:
+        return 0.0, False
+    bands, model = consistent
+    parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
+    return parallax_px, _layout_of([group[band].pair for band in bands]) is None and are_on_a_line(model.baselines)
+
+
+def _common_residuals(group: Sequence[RefinedBand]) -> list[Residual]:
+    """Return the residuals of all bands in the same windows: large ones if any band is blurred, else the smallest that
+    the residual of any band uses.
+    """
+    smallest = min((band.warped.windows for band in group), key=lambda windows: windows.side)
+    common = group[0].pair.reference.large_windows if any(band.pair.is_blurred for band in group) else smallest
+    return [b.warped.residual if b.warped.windows is common else common.residuals(b.warped.warped) for b in group]
+
+
+def _layout_of(pairs: Sequence[BandPair]) -> NDArray[np.float64] | None:
+    """Return the layouts (bands, 2) of pairs; None if the tags lack one."""
+    layouts = [pair.layout for pair in pairs]
+    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
+
+
+def _consistent_bands(
+    windows: WindowShifts, group: Sequence[RefinedBand], lens_std: NDArray[np.float64] | None = None
+) -> tuple[list[int], Adjustment] | None:
+    """Adjust the model to the bands with common parallax; return their indices and the model, or None.
+
+    A band that the parallax of the others does not explain is left out, one after another. Lens shapes are fitted with
+    the standard deviations `lens_std` (4,), not without.
+    """
+    size_px = group[0].pair.fixed.size_px
+    # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of
+    # another time. Residuals below the minimum are accepted anyway.
+    max_scale_ratio, min_foreign_px = 2.0, 0.4
+
+    def adjusted(bands: Sequence[int], lens_std: NDArray[np.float64] | None) -> Adjustment | None:
+        layout, some = _layout_of([group[band].pair for band in bands]), windows.of_bands(bands)
+        model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
+        return model if model is not None and are_of_lenses(model.baselines, layout) else None
+
+    def median_scale_px(bands: Sequence[int]) -> float:
+        model = adjusted(bands, None)
+        return math.inf if model is None else float(np.median(model.scales_px))
+
+    kept = list(range(windows.shifts_px.shape[1]))
+    model = adjusted(kept, lens_std)
+    while len(kept) > _MIN_BANDS:
+        if model is None:
+            worst = int(np.argmin([median_scale_px([b for b in kept if b != foreign]) for foreign in kept]))
+        else:
+            worst = int(model.scales_px.argmax())
+            others_px = float(np.median(np.delete(model.scales_px, worst)))
+            if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
+                break
+        kept.pop(worst)
+        model = adjusted(kept, lens_std)
+    return None if model is None else (kept, model)
 
 
 @dataclass(frozen=True)
@@ -156,27 +230,28 @@ class _Band:
         return Candidate(pair, mapping, error, residual, self.joint, held_out, held_out_p95_px=p95_px)
 
 
-def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
+def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
     """Align a group by the planes of its bands and the parallax of windows, without a relief of every pixel.
 
-    The parallax of a held-out window is that by the other bands. None without parallax. Raises GeometryError.
+    The parallax of a held-out window is that by the other bands. Empty without parallax, or if homographies fit as
+    well. Raises GeometryError.
     """
     bands, reference = [_Band(b, b.warped.mapping) for b in group], group[0].pair.reference
     rounds, model = 2, None  # large shifts are measured in steps
     for _ in range(rounds):
-        consistent = consistent_bands(_window_shifts(bands), [b.refined for b in bands])
+        consistent = _consistent_bands(_window_shifts(bands), [b.refined for b in bands])
         if consistent is None:
-            return None
+            return {}
         kept, model = consistent
         bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
     assert model is not None
-    if layout_of([b.refined for b in bands]) is None and are_on_a_line(model.baselines):
-        return None
+    if _layout_of([b.refined.pair for b in bands]) is None and are_on_a_line(model.baselines):
+        return {}
     warped = [band.refined.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.relief_check_windows.residuals(image) for image in warped]
     windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Candidate]()
     if not windows.are_enough(MIN_WINDOWS):
-        return None
+        return {}
     relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
     for number, band in enumerate(bands):
         others = np.delete(np.arange(len(bands)), number)
@@ -192,17 +267,17 @@ def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
             result[band.name] = replace(candidate, ignored=BY_PARALLAX)
-    return ReliefCandidates(reference, result, _fits_better(bands, result))
+    return result if _fits_better(bands, result) else {}
 
 
-def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> ReliefCandidates | None:
-    """Return the candidates of a group under its relief, and those of the other bands; None without a relief.
+def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> UnderRelief:
+    """Return the candidates of a group under its relief, and those of the other bands.
 
-    Raises GeometryError.
+    Empty without a relief, or if homographies fit as well. Raises GeometryError.
     """
     estimate = _Estimate.of(group)
     if estimate is None:
-        return None
+        return {}
     held_out = [
         band.held_out(verifying)
         for band, verifying in zip(estimate.bands, cycle(estimate.verifying_reliefs), strict=False)
@@ -211,12 +286,12 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Re
     result: dict[str, Candidate] = {}
     for band, warped in zip(estimate.bands, held_out, strict=True):
         result |= estimate.candidate(band, warped)
-    fits_better = _fits_better(estimate.bands, result)
-    if fits_better:
-        result |= estimate.of_other_bands(others)
-        if not any(band.pair.has_rig for band in group):
-            result = {name: _with_field(candidate) for name, candidate in result.items()}
-    return ReliefCandidates(group[0].pair.reference, result, fits_better)
+    if not _fits_better(estimate.bands, result):
+        return {}
+    result |= estimate.of_other_bands(others)
+    if any(band.pair.has_rig for band in group):
+        return result
+    return {name: _with_field(candidate) for name, candidate in result.items()}
 
 
 @dataclass(frozen=True)
@@ -236,11 +311,11 @@ class _Estimate:
         """
         planes, size_px = [_Band(b, b.warped.mapping) for b in group], group[0].pair.fixed.size_px
         lens_std = None if any(b.pair.has_rig for b in group) else group[0].pair.lens_std_px
-        consistent = consistent_bands(_window_shifts(planes), group, lens_std)
+        consistent = _consistent_bands(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
         kept, model = consistent
-        layout = layout_of([group[k] for k in kept])
+        layout = _layout_of([group[k].pair for k in kept])
         bands = [planes[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
         max_rounds = 3
         for _ in range(max_rounds):
@@ -290,7 +365,7 @@ class _Estimate:
         The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
         GeometryError.
         """
-        prior, layout = BaselinePrior(), layout_of([band, *(b.refined for b in self.bands)])
+        prior, layout = BaselinePrior(), _layout_of([band.pair, *(b.refined.pair for b in self.bands)])
         if layout is not None:
             own, others, baselines = layout[0], layout[1:], _baselines(self.bands)
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline

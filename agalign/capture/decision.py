@@ -25,7 +25,7 @@ not fit it: it has `failed`, and the rig does not replace it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from agalign.capture.by_relief import ReliefCandidates
+from agalign.capture.by_relief import UnderRelief
 from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.values.alignment import STD_DECIMALS, Alignment, Alignments, Prediction
@@ -35,33 +35,30 @@ from agalign.verify.checks import MAX_UNEXPECTED_PX, rig_issues
 
 def decide(
     bands: Sequence[BandCandidates],
-    reliefs: Sequence[ReliefCandidates] = (),
+    reliefs: Sequence[UnderRelief] = (),
     predictions: Mapping[str, RigPrediction] | None = None,
 ) -> Alignments:
     """Return the alignments of the bands of a capture by name, px of the images.
 
     `predictions` are those of the rig by band.
     """
-    return _aligned(bands, _chosen_relief(bands, reliefs), predictions or {})
+    return _aligned(bands, _of_several_reliefs(bands, reliefs), predictions or {})
 
 
-def _chosen_relief(bands: Sequence[BandCandidates], reliefs: Sequence[ReliefCandidates]) -> ReliefCandidates | None:
-    """The relief of the capture, by its images alone: predictions by the rig have this relief; None if no relief fits
-    half of its bands.
-    """
-    fitting = [relief for relief in reliefs if relief.fits_better]
+def _of_several_reliefs(bands: Sequence[BandCandidates], reliefs: Sequence[UnderRelief]) -> UnderRelief:
+    """The relief of the capture, by its images alone: predictions by the rig have this relief. Empty without one."""
 
-    def delivered(relief: ReliefCandidates) -> tuple[int, int]:
+    def delivered(relief: UnderRelief) -> tuple[int, int]:
         alignments = _aligned(bands, relief, {}).values()
         return sum(a.is_usable(DELIVERED_STD_PX) for a in alignments), sum(a.status == "aligned" for a in alignments)
 
-    return max(fitting, key=delivered) if len(fitting) > 1 else next(iter(fitting), None)
+    return max(reliefs, key=delivered) if len(reliefs) > 1 else next(iter(reliefs), {})
 
 
 def _aligned(
-    bands: Sequence[BandCandidates], relief: ReliefCandidates | None, predictions: Mapping[str, RigPrediction]
+    bands: Sequence[BandCandidates], relief: UnderRelief, predictions: Mapping[str, RigPrediction]
 ) -> Alignments:
-    """Return the alignments with one relief, or with none."""
+    """Return the alignments with one relief, or with none if it is empty."""
     result: Alignments = {}
     for band in bands:
         choice, of_rig = _of_images(band, relief), predictions.get(band.pair.name)
@@ -125,15 +122,15 @@ def _prediction(chosen: Candidate, compared: Prediction | None) -> Prediction:
     return Prediction(chosen.pair.scales.between_files(fixed_to_moving), "windows", std_px)
 
 
-def _of_images(band: BandCandidates, relief: ReliefCandidates | None) -> _Choice:
+def _of_images(band: BandCandidates, relief: UnderRelief) -> _Choice:
     """Choose from what the images of the capture show; nothing if the pixels of the band cannot be read."""
     if band.is_unreadable:
         return _Choice(band, None, band.rejected, is_seed_refused=True)
-    under = None if relief is None else relief.candidates.get(band.pair.name)
+    under = relief.get(band.pair.name)
     if under is not None:
         return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues) if under.issues else ())
     if accepted := band.accepted:
-        is_beside = relief is not None and relief.reference is band.pair.reference
+        is_beside = any(other.pair.reference is band.pair.reference for other in relief.values())
         return _Choice(band, accepted[-1], (Issue(OTHER_GEOMETRY),) if is_beside else ())
     predicting = [candidate for candidate in band.candidates if candidate.may_predict]
     if predicting:

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
+from agalign.capture.candidate import Candidate, mapping_error
 from agalign.errors import UnreadableFileError
 from agalign.fit.window_fit import cross_fitted
 from agalign.fit.windows import FixedWindows
@@ -34,15 +34,15 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
 
 
-def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) -> Candidate | Issue | None:
-    """Return the candidate of a band that is fitted to tiles of the files, from one by the reduced images, whose
-    displacement field it has: windows of those images have verified it.
+def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue | None:
+    """Return the candidate that is fitted to tiles of the files, from one by the reduced images, whose displacement
+    field it has: windows of those images have verified it.
 
     None if the tiles have too little structure, or if the shifts of held-out windows do not decrease. The issue
     UNREADABLE if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
     UnreadableFileError for the reference.
     """
-    pair = band.pair
+    pair = start.pair
     up = pair.scales.fixed.inverse, pair.scales.moving.inverse
     residual, mapping = start.residual.in_file_px(pair.scales), start.mapping.rescaled(*up)
     with open_raster(reference.path, reference.page) as source:

@@ -18,10 +18,18 @@ from agalign.capture import align_bands
 from agalign.capture import by_relief as relief_module
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_relief import ReliefCandidates, _decreases_shifts, _Estimate, _fits_better, _std_px, by_relief
+from agalign.capture.by_relief import (
+    MIN_PARALLAX_PX,
+    UnderRelief,
+    _common_parallax_px,
+    _decreases_shifts,
+    _Estimate,
+    _fits_better,
+    _std_px,
+    by_relief,
+)
 from agalign.capture.by_rig import _parallax_by_rig, observed, rig_predictions
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
-from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
 from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
 from agalign.config import JointSettings, ReliefSettings, Settings
@@ -119,7 +127,7 @@ def aligned_by_relief(
 ) -> tuple[dict[str, Alignment], set[str]]:
     """The alignments of the bands that follow the relief of a capture, and the bands with parallax along a line."""
     reliefs, along_a_line = by_relief(bands, use, is_observation=is_observation)
-    names = {name for relief in reliefs if relief.fits_better for name in relief.candidates}
+    names = {name for relief in reliefs for name in relief}
     result = decide(unaligned(bands), reliefs)
     return {name: alignment for name, alignment in result.items() if name in names}, along_a_line
 
@@ -134,7 +142,7 @@ def without_layout(candidates: Sequence[RefinedBand]) -> list[RefinedBand]:
 
 
 def shows_relief(candidates: Sequence[RefinedBand]) -> bool:
-    parallax_px, on_a_line = common_parallax_px(candidates)
+    parallax_px, on_a_line = _common_parallax_px(candidates)
     return parallax_px >= MIN_PARALLAX_PX and not on_a_line
 
 
@@ -245,8 +253,8 @@ def test_bands_along_a_line_do_not_follow_the_relief_of_other_bands(
 ) -> None:
     *on_a_line, other = candidates[:3]
     with_relief, offered = [other, other], list[list[RefinedBand]]()
-    monkeypatch.setattr(relief_module, "parallax_groups", lambda _: [with_relief, on_a_line])
-    monkeypatch.setattr(relief_module, "common_parallax_px", lambda group: (2.0, group is on_a_line))
+    monkeypatch.setattr(relief_module, "_parallax_groups", lambda _: [with_relief, on_a_line])
+    monkeypatch.setattr(relief_module, "_common_parallax_px", lambda group: (2.0, group is on_a_line))
     monkeypatch.setattr(relief_module, "_of_group", lambda _, others: offered.append(others))
     assert by_relief(candidates, "auto") == ([], {band.pair.name for band in on_a_line})
     assert offered == [[band for band in candidates if band not in on_a_line]]
@@ -275,13 +283,13 @@ def test_neither_relief_nor_field_replaces_another_model_family(
         assert (len(alignment.held_out_p95_px) > 1) == is_allowed
 
 
-def flat_relief_of(*bands: RefinedBand) -> ReliefCandidates:
+def flat_relief_of(*bands: RefinedBand) -> UnderRelief:
     """The candidates of some bands under a relief without parallax."""
     relief, result = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32)), dict[str, Candidate]()
     for band in bands:
         under = band.warped.with_mapping(band.warped.mapping.with_parallax(Parallax(relief, (1, 0))))
         result[band.pair.name] = Candidate.of(under, band.joint)
-    return ReliefCandidates(bands[0].pair.reference, result, True)
+    return result
 
 
 @pytest.mark.parametrize("is_together", [True, False])
@@ -307,9 +315,9 @@ def test_a_band_under_an_earlier_relief_alone_is_not_at_its_seed(
     """Two bands are learned from scratch after the relief of a third one, and a relief without it delivers more."""
     bands = {band.pair.name: band for band in flat.refined()}
     of_blue = flat_relief_of(bands["Blue"])
-    blue = of_blue.candidates["Blue"]
+    blue = of_blue["Blue"]
     uncertain = {"Blue": replace(blue, error=replace(blue.error, rig_std_px=9.0))}
-    found = [flat_relief_of(bands["Red"], bands["NIR"]), replace(of_blue, candidates=uncertain)]
+    found = [flat_relief_of(bands["Red"], bands["NIR"]), uncertain]
     monkeypatch.setattr(align_bands, "by_relief", lambda *_, **__: ([found.pop()], set()))
     estimation = CaptureEstimation(Settings(), None, quiet)
     for some in (["Blue"], ["Red", "NIR"]):
@@ -481,7 +489,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
         for (name, a), pair in zip(aligned.items(), pairs, strict=True)
         if name != "Blue"
     }
-    reliefs = [ReliefCandidates(pairs[0].reference, without_blue, True)]
+    reliefs = [without_blue]
     known = decide(bands, reliefs)
     predictions = rig_predictions(pairs, known, rig, observed(pairs, known, Capture("a", Path(), (), 0)))
     result = decide(bands, reliefs, predictions)

@@ -18,7 +18,7 @@ from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import CaptureEstimation, align_capture_bands
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_relief import ReliefCandidates
+from agalign.capture.by_relief import UnderRelief
 from agalign.capture.by_rig import bands_to_learn
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.config import CheckSettings, Settings
@@ -120,8 +120,8 @@ class Estimated:
         return changed.decided(changed._predictions(self.pairs, self.capture))
 
 
-def without_nir(relief: ReliefCandidates) -> ReliefCandidates:
-    return replace(relief, candidates={name: c for name, c in relief.candidates.items() if name != "NIR"})
+def without_nir(relief: UnderRelief) -> UnderRelief:
+    return {name: c for name, c in relief.items() if name != "NIR"}
 
 
 @pytest.fixture(scope="module")

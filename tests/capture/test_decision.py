@@ -9,7 +9,7 @@ import pytest
 
 from agalign.capture import decision
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_relief import ReliefCandidates
+from agalign.capture.by_relief import UnderRelief
 from agalign.capture.by_rig import RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
 from agalign.capture.decision import decide
@@ -220,27 +220,24 @@ class Together:
         default_factory=lambda: {n: BandCandidates(pair(n), SEED, None, [candidate(n)]) for n in ("Blue", "Red", "NIR")}
     )
 
-    def decided(self, *reliefs: ReliefCandidates) -> dict[str, Alignment]:
+    def decided(self, *reliefs: UnderRelief) -> dict[str, Alignment]:
         return decide(list(self.bands.values()), reliefs)
 
 
-def relief_of(*names: str, fits_better: bool = True, predicted: Mapping[str, float] | None = None) -> ReliefCandidates:
+def relief_of(*names: str, predicted: Mapping[str, float] | None = None) -> UnderRelief:
     """One relief under which some bands are aligned, and others predicted with a standard error."""
     relief = flat_relief()
     found = {n: candidate(n, relief=relief) for n in names}
-    found |= {
+    return found | {
         n: candidate(n, relief=relief, std_px=s, inherited_issues=(IN_PART,)) for n, s in (predicted or {}).items()
     }
-    return ReliefCandidates(pair().reference, found, fits_better)
 
 
-@pytest.mark.parametrize("is_chosen", [False, True])
-def test_a_relief_is_chosen_if_it_fits_better(is_chosen: bool) -> None:
-    result = Together().decided(relief_of("Blue", "Red", "NIR", fits_better=is_chosen))
+def test_all_bands_have_the_same_relief() -> None:
+    result = Together().decided(relief_of("Blue", "Red", "NIR"))
     assert {a.status for a in result.values()} == {"aligned"}
-    assert {a.geometry for a in result.values()} == {"relief" if is_chosen else "homography"}
-    if is_chosen:
-        assert len({id(a.mapping.parallax.relief) for a in result.values()}) == 1
+    assert {a.geometry for a in result.values()} == {"relief"}
+    assert len({id(a.mapping.parallax.relief) for a in result.values()}) == 1
 
 
 def test_a_homography_beside_a_relief_is_predicted_with_its_own_error() -> None:
@@ -287,7 +284,7 @@ def test_of_two_reliefs_the_one_that_delivers_more_bands_is_that_of_all(
     reliefs = [relief_of(*names) for names in (first, second)]
     result = Together().decided(*reliefs)
     used = {id(a.mapping.parallax.relief) for a in result.values() if a.mapping.parallax is not None}
-    assert used == {id(c.mapping.parallax.relief) for c in reliefs[chosen].candidates.values()}
+    assert used == {id(c.mapping.parallax.relief) for c in reliefs[chosen].values()}
 
 
 def test_predictions_by_the_rig_which_have_the_relief_of_the_images_do_not_change_it(
@@ -301,16 +298,6 @@ def test_predictions_by_the_rig_which_have_the_relief_of_the_images_do_not_chang
     for name in ("Blue", "Red"):
         assert result[name].mapping.parallax is by_images[name].mapping.parallax
         assert result[name].status == "aligned"
-
-
-def test_a_relief_that_fits_worse_is_no_option() -> None:
-    """Even if it would deliver more bands."""
-    result = Together().decided(relief_of("Blue", "Red", "NIR", fits_better=False), relief_of("Blue"))
-    assert {name: a.geometry for name, a in result.items()} == {
-        "Blue": "relief",
-        "Red": "homography",
-        "NIR": "homography",
-    }
 
 
 # ---- the rig of the flight

@@ -73,7 +73,7 @@ def on_reduced_images(pair: BandPair, **joint: Any) -> Candidate:
 
 
 def refined(capture: Capture, start: Candidate) -> Candidate:
-    result = at_full_resolution(capture.reference, BandCandidates(start.pair, SEED), start)
+    result = at_full_resolution(capture.reference, start)
     assert isinstance(result, Candidate)
     return result
 
@@ -198,4 +198,4 @@ def test_an_unreadable_reference_is_an_error_of_the_capture(capture: Capture, pa
     (tmp_path / "broken.tif").write_bytes(b"II*\0")
     reference = replace(capture.reference, path=tmp_path / "broken.tif")
     with pytest.raises(UnreadableFileError, match=r"broken\.tif"):
-        at_full_resolution(reference, BandCandidates(pair, SEED), on_reduced_images(pair))
+        at_full_resolution(reference, on_reduced_images(pair))
