@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_descriptors import by_descriptors
 from agalign.capture.by_relief import UnderRelief, by_relief
 from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, bands_to_learn, observed, rig_predictions
 from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is_extrapolated, spreads_of_relief_px
@@ -284,7 +283,7 @@ class CaptureEstimation:
             if name in new - under and self.bands[name].issue is None:
                 self.progress(name, "checking", 0.0)
                 field_use = "never" if self.is_observation or name in along_a_line else use
-                self.bands[name].candidates += by_descriptors(band, field_use)
+                self.bands[name].candidates += band.candidates(field_use)
 
     def _combined(self) -> list[RefinedBand]:
         """Return the refined bands after the MAP estimation of all bands of the capture."""

@@ -1,7 +1,7 @@
 """Candidates: the mappings that a band may get, each with its error and the windows that verify it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.warped_pair import WarpedPair
+from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import BY_WINDOWS, JointResult, Seed
-from agalign.values.choices import Geometry
+from agalign.values.choices import Geometry, ReliefUse, SeedKind
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
-from agalign.verify.checks import PREDICTED_WITH, issues_of, seed_fits
+from agalign.verify.checks import BY_PARALLAX, PREDICTED_WITH, is_unchanged, issues_of, seed_fits
 from agalign.verify.coverage import pixels_in_frame, points_in_frame
 
 
@@ -147,8 +148,6 @@ class RefinedBand:
     After the MAP estimation, `joint` is its result, and the windows are still those under the mapping before it.
     """
 
-    pair: BandPair
-    seed: Seed
     joint: JointResult
     """Without evidence of descriptors, at the seed, if the optimisation has no result."""
     warped: WarpedPair
@@ -159,9 +158,49 @@ class RefinedBand:
 
     @classmethod
     def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "RefinedBand":
-        """Measure the windows with the homography of a result."""
+        """Measure the windows with the homography of a result, or with the seed if there is none."""
         joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
-        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
+        return cls(joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
+
+    @property
+    def pair(self) -> BandPair:
+        """The pair of the band."""
+        return self.warped.pair
+
+    @property
+    def verified(self) -> WarpedPair:
+        """The images under the result, with the residual of each half of its windows under that by the other half."""
+        warped = self.warped.with_mapping(self.pair.mapping(self.joint.fixed_to_moving))
+        return warped if self.by_halves is None else warped.cross_validated(self.by_halves)
+
+    def candidates(self, use: ReliefUse) -> Iterator[Candidate]:
+        """Yield the homography, then the same with a displacement field, or with the p95 of both if it is rejected.
+
+        A field is fitted if parallax may cause all issues of the homography, or if there are none and no rig contains
+        the distortion of the lenses; always with `use` "always", not with "never".
+        """
+        band = self._unchanged_if_aligned
+        joint, verified = band.joint, band.verified
+        plane = Candidate.of(verified, joint)
+        yield plane
+        is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not self.pair.has_rig))
+        if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
+            yield from _with_field(plane, verified, joint)
+
+    @property
+    def _unchanged_if_aligned(self) -> "RefinedBand":
+        """The band with the mapping given by the files, if its own does not differ significantly.
+
+        Input that is aligned already is returned unchanged instead of resampled by a small shift.
+        """
+        pair, joint = self.pair, self.joint
+        kinds: tuple[SeedKind, ...] = ("geo", "identity")
+        for given in (pair.seed_matrices[kind] for kind in kinds if kind in pair.seed_matrices):
+            if pair.mapping(given).is_curved:
+                continue  # with lens distortion the files are not aligned
+            if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
+                return replace(self, joint=replace(joint, fixed_to_moving=given), by_halves=None)
+        return self
 
     def relief_fit_residual(self, mapping: PixelMapping) -> Residual:
         """Measure the windows of the fit with a mapping."""
@@ -173,6 +212,25 @@ class RefinedBand:
 
     def _warped(self, mapping: PixelMapping) -> Raster:
         return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
+
+
+def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
+    """Yield the candidate with a displacement field, verified by windows that it is not fitted to; the same without one
+    if the field does not reduce their shifts, or if only the homography passes.
+    """
+    pair = plane.pair
+    displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    if displacement is None:
+        return
+    p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
+    without = replace(plane, held_out_p95_px=p95_px)
+    if displacement.field is None:
+        yield without
+        return
+    displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
+    held_out = Candidate.of(displaced, joint, displacement.held_out)
+    with_field = replace(held_out, other_residual=displaced.residual, held_out_p95_px=p95_px)
+    yield without if with_field.issues and not plane.issues else with_field
 
 
 def result_of_windows(fixed_to_moving: Matrix) -> JointResult:

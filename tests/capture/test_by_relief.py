@@ -107,8 +107,7 @@ class Rendered:
             layout = -band.baseline_m[0], -band.baseline_m[1]
             matrix = self.plane(band)
             pair = BandPair(band.name, reference, self.raster(band, images), {"rig": matrix}, layout=layout)
-            seed = Seed("rig", matrix, 30.0, 30.0, 5.0)
-            result.append(RefinedBand.of(pair, seed, joint_result(matrix)))
+            result.append(RefinedBand.of(pair, seed_of(pair), joint_result(matrix)))
         return result
 
     def correlation(self, mapping: PixelMapping) -> float:
@@ -120,6 +119,10 @@ class Rendered:
         """Return (n,) errors of all pixels that are visible in the band."""
         known = self.truth.bands[band]
         return np.asarray(np.linalg.norm(mapping(self.pixels) - known.moving_px, axis=-1)[known.visible])
+
+
+def seed_of(pair: BandPair) -> Seed:
+    return Seed("rig", pair.seed_matrices["rig"], 30.0, 30.0, 5.0)
 
 
 def aligned_by_relief(
@@ -134,11 +137,16 @@ def aligned_by_relief(
 
 def unaligned(bands: Sequence[RefinedBand]) -> list[BandCandidates]:
     """The bands without other candidates than those under a relief."""
-    return [BandCandidates(band.pair, band.seed, Issue(RETRIEVAL, 0.0, 0.2)) for band in bands]
+    return [BandCandidates(band.pair, seed_of(band.pair), Issue(RETRIEVAL, 0.0, 0.2)) for band in bands]
+
+
+def with_pair(band: RefinedBand, **facts: object) -> RefinedBand:
+    """The band with other facts of its pair."""
+    return replace(band, warped=replace(band.warped, pair=replace(band.pair, **facts)))
 
 
 def without_layout(candidates: Sequence[RefinedBand]) -> list[RefinedBand]:
-    return [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
+    return [with_pair(c, layout=None) for c in candidates]
 
 
 def shows_relief(candidates: Sequence[RefinedBand]) -> bool:
@@ -268,7 +276,7 @@ def verified_together(bands: Sequence[RefinedBand], settings: Settings) -> dict[
 
 def add(estimation: CaptureEstimation, bands: Sequence[RefinedBand]) -> None:
     """Add the results of bands to those of a capture."""
-    estimation.add([(b.pair, b.seed) for b in bands], [b.joint for b in bands])
+    estimation.add([(b.pair, seed_of(b.pair)) for b in bands], [b.joint for b in bands])
 
 
 @pytest.mark.full
@@ -341,7 +349,7 @@ def test_the_relief_is_estimated_once_if_nothing_is_learned(
         return result
 
     joints = {band.pair.name: band.joint for band in candidates}
-    seeds = {band.pair.name: band.seed for band in candidates}
+    seeds = {band.pair.name: seed_of(band.pair) for band in candidates}
     monkeypatch.setattr(_Estimate, "of", classmethod(counted))
     monkeypatch.setattr(align_bands, "find_seed", lambda pair, *_: seeds[pair.name])
     monkeypatch.setattr(CaptureEstimation, "_optimised", lambda _, starts, *__: [joints[p.name] for p, _ in starts])
@@ -363,7 +371,7 @@ def test_bands_with_and_without_a_lens_model_have_one_relief(four_lenses: Render
             bands.append(band)
             continue
         pair = replace(band.pair, moving_image=replace(band.pair.moving_image, lens=None))
-        bands.append(RefinedBand.of(pair, band.seed, joint_result(four_lenses.plane_of_raw_pixels(pair.name))))
+        bands.append(RefinedBand.of(pair, seed_of(pair), joint_result(four_lenses.plane_of_raw_pixels(pair.name))))
     estimation = CaptureEstimation(Settings(), None, quiet)
     add(estimation, bands)
     assert len(estimation.reliefs) == 2
@@ -385,7 +393,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
     candidates = scene.refined(instead={name: noisy.clip(1, 65000).astype(np.float32)})
     if not has_result:
         lost = Issue(NO_CONTRAST)
-        candidates = [c if c.pair.name != name else RefinedBand.of(c.pair, c.seed, lost) for c in candidates]
+        candidates = [c if c.pair.name != name else RefinedBand.of(c.pair, seed_of(c.pair), lost) for c in candidates]
     alignment = aligned_by_relief(candidates, "auto")[0][name]
     assert (alignment.status, alignment.mapping.parallax is None) == (status, False)
     errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.without_parallax))
@@ -402,7 +410,9 @@ def test_a_band_that_shows_nothing_in_a_part_claims_the_error_there(four_lenses:
     image = four_lenses.images[name].copy()
     image[:, int(0.4 * image.shape[1]) :] = 60_000
     candidates = four_lenses.refined({name: image})
-    lost = [RefinedBand.of(c.pair, c.seed, Issue(NO_CONTRAST)) if c.pair.name == name else c for c in candidates]
+    lost = [
+        RefinedBand.of(c.pair, seed_of(c.pair), Issue(NO_CONTRAST)) if c.pair.name == name else c for c in candidates
+    ]
     prediction, mapping = (getattr(aligned_by_relief(lost, "auto")[0][name], of) for of in ("prediction", "mapping"))
     p68_px = np.percentile(four_lenses.error_px(name, mapping), 68)
     assert 0.5 * p68_px < prediction.std_px < 4 * p68_px
@@ -482,7 +492,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     none, from_bands_px = (dict.fromkeys(mean, float(value)) for value in (0.0, 0.05))
     rig = Rig(boxes.size_px, mean, baselines, none, none, ("distance",), (), from_bands_px)
     reduced = PairScales(moving=PixelScale(1 / magnification, 1 / magnification))
-    candidates = [replace(c, pair=replace(c.pair, scales=reduced)) if c.pair.name == "Blue" else c for c in candidates]
+    candidates = [with_pair(c, scales=reduced) if c.pair.name == "Blue" else c for c in candidates]
     pairs, bands = [c.pair for c in candidates], unaligned(candidates)
     without_blue = {
         name: Candidate(pair, a.mapping, a.error, a.residual, a.joint)
@@ -549,7 +559,7 @@ def test_use(candidates: Sequence[RefinedBand]) -> None:
     assert aligned_by_relief(candidates, "never") == ({}, set())
     # One moving band cannot be verified with others; a coarse one has another reference.
     assert aligned_by_relief(candidates[:1], "always") == ({}, set())
-    coarse = [replace(c, pair=replace(c.pair, is_coarse=True)) for c in candidates[1:]]
+    coarse = [with_pair(c, is_coarse=True) for c in candidates[1:]]
     assert aligned_by_relief([candidates[0], *coarse], "always") == ({}, set())
 
 

@@ -49,7 +49,7 @@ def corners_near_the_mean(result: JointResult) -> np.ndarray:
 
 def band(pair: BandPair, joint: JointResult, windows: Residual = NOTHING) -> RefinedBand:
     mapping = pair.mapping(joint.fixed_to_moving)
-    return RefinedBand(pair, SEED, joint, WarpedPair(pair, mapping, pair.moving_image, pair.windows, windows))
+    return RefinedBand(joint, WarpedPair(pair, mapping, pair.moving_image, pair.windows, windows))
 
 
 def found_together(red: JointResult, nir: JointResult, the_rig: Rig | None) -> dict[str, JointResult]:

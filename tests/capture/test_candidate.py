@@ -10,7 +10,6 @@ from agalign.batch.capture_task import quiet
 from agalign.capture import candidate as module
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_descriptors import by_descriptors
 from agalign.capture.candidate import RefinedBand, mapping_error
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import Settings
@@ -44,7 +43,7 @@ def aligned(
     by_halves: tuple[Matrix, Matrix] | None = None,
 ) -> Alignment:
     """The alignment of a band by the result of the joint optimisation."""
-    return decided(pair, seed, by_descriptors(replace(RefinedBand.of(pair, seed, joint), by_halves=by_halves), use))
+    return decided(pair, seed, replace(RefinedBand.of(pair, seed, joint), by_halves=by_halves).candidates(use))
 
 
 def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
