@@ -32,8 +32,8 @@ SCHEDULE = ((2e-3, 100), (5e-4, 50))
 def read_group(capture: Capture) -> ImageGroup:
     """Read the images of a synthetic capture, which all have the same reference, with their seeds."""
     pairs, _ = read_pairs(capture, SeedSettings())
-    starts = [(pair, seed) for pair in pairs if isinstance(seed := find_seed(pair, SeedSettings()), Seed)]
-    ((_, group),) = image_groups(starts)
+    seeds = {p.name: seed for p in pairs if isinstance(seed := find_seed(p, SeedSettings()), Seed)}
+    (group,) = image_groups(pairs, seeds)
     return group
 
 

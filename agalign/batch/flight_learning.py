@@ -187,7 +187,7 @@ class _FlightLearner:
         settings = self.settings
         read = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
         loaded = [capture for capture in read if capture is not None]
-        groups = [group for capture in loaded for _, group in capture.groups]
+        groups = [group for capture in loaded for group in capture.groups]
         with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:

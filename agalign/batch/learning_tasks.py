@@ -9,17 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import CaptureEstimation, aligned_groups
+from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import observed
-from agalign.capture.seeding import SeededPair, find_seed, image_groups
+from agalign.capture.candidate import BandCandidates
+from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Observation
 from agalign.method.descriptor import Descriptor, start_from
 from agalign.method.device import choose_device
-from agalign.method.joint import refine_with
+from agalign.method.joint import Results, refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.capture_pixels import CapturePixels
@@ -108,26 +109,30 @@ class LoadedCapture:
     """The images of a capture to learn the network from, and their seeds."""
 
     capture: Capture
-    groups: list[tuple[list[int], ImageGroup]]
-    """Groups of images, each with the indices of its pairs in `starts`."""
-    starts: list[SeededPair]
+    pairs: list[BandPair]
+    seeds: dict[str, Seed]
+    """By band."""
+    groups: list[ImageGroup]
 
     @property
     def similarity_sigma(self) -> float:
         """Median height of the correlation peaks of the seeds, in standard deviations."""
-        return float(np.median([seed.peak_sigma for _, seed in self.starts]))
+        return float(np.median([seed.peak_sigma for seed in self.seeds.values()]))
 
     @property
     def is_trusted(self) -> bool:
         """True if all seeds are confirmed by the images."""
-        return all(seed.trusted for _, seed in self.starts)
+        return all(seed.trusted for seed in self.seeds.values())
 
     def refined_by(self, net: Descriptor, settings: Settings) -> LearningCapture:
         """Refine the pairs by a network and verify them, as observations of the rig; return them without images."""
-        estimation = CaptureEstimation(settings, None, quiet, is_observation=True)
-        results = aligned_groups(self.groups, lambda g: refine_with(net, g, settings.joint, quiet, FLIGHT_PATCHES))
-        estimation.add(self.starts, results)
-        return LearningCapture.of(self.capture, [pair for pair, _ in self.starts], estimation)
+        results: Results = {}
+        bands = {pair.name: BandCandidates(pair, self.seeds[pair.name]) for pair in self.pairs}
+        estimation = CaptureEstimation(settings, None, quiet, is_observation=True, bands=bands)
+        for group in self.groups:
+            results |= refine_with(net, group, settings.joint, quiet, FLIGHT_PATCHES)
+        estimation.add(results)
+        return LearningCapture.of(self.capture, self.pairs, estimation)
 
 
 def load_capture(
@@ -144,16 +149,14 @@ def load_capture(
     """
     with logged_failure(f"{capture.label} cannot be learned from"):
         pairs = [p for p in _pairs_of(capture, settings) if p.has_rig_pixels]
-        seeds_of = [(p, known[p.name].seed if p.name in known else find_seed(p, settings.seed, start)) for p in pairs]
-        result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
-        if result:
-            groups = image_groups(result, [bands.index(p.name) + 1 for p, _ in result])
-            for places, group in groups:
-                for k, place in enumerate(places):
-                    pair = known.get(result[place][0].name)
-                    if pair is not None and pair.result.is_retrieved:
-                        group.moving[k].fixed_to_moving = pair.result.fixed_to_moving
-            return LoadedCapture(capture, groups, result)
+        found = {p.name: known[p.name].seed if p.name in known else find_seed(p, settings.seed, start) for p in pairs}
+        seeds = {name: seed for name, seed in found.items() if isinstance(seed, Seed)}
+        if seeds:
+            groups = image_groups(pairs, seeds, {name: bands.index(name) + 1 for name in seeds})
+            for moving in (image for group in groups for image in group.moving):
+                if moving.name in known and known[moving.name].result.is_retrieved:
+                    moving.fixed_to_moving = known[moving.name].result.fixed_to_moving
+            return LoadedCapture(capture, [p for p in pairs if p.name in seeds], seeds, groups)
     return None
 
 

@@ -14,7 +14,7 @@ from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.metrics import with_metrics
-from agalign.capture.seeding import SeededPair, corrected, find_seed, image_groups
+from agalign.capture.seeding import corrected, find_seed, image_groups
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
@@ -134,11 +134,11 @@ class CaptureEstimation:
         Pairs that the flight's network cannot align are learned from scratch, with a rig only those without an accurate
         prediction; without `scratch`, only pairs that the network does not contain.
         """
-        starts = self._seeded(pairs)
+        self._find_seeds(pairs)
         if self.settings.seed.only:
             return self.decided()
-        self.refine(starts)
-        self._learn(starts, capture, scratch=scratch)
+        self._refine()
+        self._learn(capture, scratch=scratch)
         self._fit_windows()
         if self.is_observation:
             return self.decided()
@@ -152,55 +152,53 @@ class CaptureEstimation:
         """Return the alignments by what has been found."""
         return decide(list(self.bands.values()), self.reliefs, predictions)
 
-    def _seeded(self, pairs: Sequence[BandPair]) -> list[SeededPair]:
-        """Find the seeds; return the pairs that have one."""
-        starts: list[SeededPair] = []
+    def _find_seeds(self, pairs: Sequence[BandPair]) -> None:
+        """Find the seeds."""
         for pair in pairs:
             self.progress(pair.name, "seeding", 0.0)
             seed = find_seed(pair, self.settings.seed, self.model)
             is_asked_for = self.settings.seed.only and isinstance(seed, Seed)
             self.bands[pair.name] = BandCandidates(pair, seed, Issue(SEED_ASKED_FOR) if is_asked_for else None)
-            if isinstance(seed, Seed):
-                starts.append((pair, seed))
-        return starts
 
-    def refine(self, starts: Sequence[SeededPair]) -> None:
-        """Align the pairs of the bands that the flight's network contains with this network."""
+    @property
+    def _seeds(self) -> dict[str, Seed]:
+        """The seeds of the bands that have one."""
+        return {name: band.seed for name, band in self.bands.items() if isinstance(band.seed, Seed)}
+
+    def _refine(self) -> None:
+        """Align the bands that the flight's network contains with this network."""
         model = self.model
-        if model is None or self.settings.joint.recipe == "paper":
+        if model is None:
             return
-        known = [s for s in starts if model.side(s[0].name) is not None]
-        sides = [model.side(pair.name) or 0 for pair, _ in known]
+        sides = {name: side for name in self.bands if (side := model.side(name)) is not None}
         patches = PATCHES if model.rig is None else FLIGHT_PATCHES
 
-        def optimised(some: Sequence[SeededPair], of_sides: Sequence[int]) -> Results:
-            return self._optimised(
-                some,
-                of_sides,
-                lambda group, report: refine_with(model.net, group, self.settings.joint, report, patches),
-            )
+        def refined(group: ImageGroup, report: Progress) -> Results:
+            return refine_with(model.net, group, self.settings.joint, report, patches)
 
-        results = optimised(known, sides)
+        seeds = {name: seed for name, seed in self._seeds.items() if name in sides}
+        results = self._optimised(seeds, refined, sides)
         # Tags may have the wrong scale: descriptors that do not align a seed may align it once windows correct it.
-        again = {k: start for k, r in enumerate(results) if not is_retrieved(r) and (start := corrected(known[k]))}
-        for k, result in zip(again, optimised(list(again.values()), [sides[k] for k in again]), strict=True):
-            results[k] = result if is_retrieved(result) else results[k]
-        self.add(known, results)
+        again = {
+            name: other
+            for name, seed in seeds.items()
+            if not is_retrieved(results[name]) and (other := corrected(self.bands[name].pair, seed)) is not None
+        }
+        others = self._optimised(again, refined, sides)
+        self.add(results | {name: result for name, result in others.items() if is_retrieved(result)})
 
-    def _learn(self, starts: Sequence[SeededPair], capture: Capture | None, *, scratch: bool) -> None:
+    def _learn(self, capture: Capture | None, *, scratch: bool) -> None:
         """Align pairs with networks that are learned from scratch."""
-        result = self.decided()
+        result, seeds = self.decided(), self._seeds
         done = {b.pair.name for b in self.refined if not scratch or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
-        remaining = [s for s in starts if s[0].name not in done]
+        remaining = {name: seed for name, seed in seeds.items() if name not in done}
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
-            names = bands_to_learn([pair for pair, _ in starts], result, rig, capture)
-            remaining = [s for s in remaining if s[0].name in names]
+            names = bands_to_learn([self.bands[name].pair for name in seeds], result, rig, capture)
+            remaining = {name: seed for name, seed in remaining.items() if name in names}
         if remaining:
-            results = self._optimised(
-                remaining, [], lambda group, report: align_from_scratch(group, self.settings.joint, report)
-            )
-            self.add(remaining, results)
+            joint = self.settings.joint
+            self.add(self._optimised(remaining, lambda group, report: align_from_scratch(group, joint, report)))
 
     def _fit_windows(self) -> None:
         """Fit windows alone where the descriptors have no result."""
@@ -251,33 +249,40 @@ class CaptureEstimation:
                 band.candidates.append(refined)
 
     def _optimised(
-        self, starts: Sequence[SeededPair], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
+        self,
+        seeds: Mapping[str, Seed],
+        align: Callable[[ImageGroup, Progress], Results],
+        sides: Mapping[str, int] | None = None,
     ) -> Results:
-        """Return the results of the pairs, by image group, with the network's `sides`."""
-        if not starts:
-            return []
-        report = partial(self.progress, starts[0][0].name)  # with the name of the first pair
+        """Return the results of the bands with these `seeds`, with their `sides` of the network."""
+        if not seeds:
+            return {}
+        report = partial(self.progress, next(iter(seeds)))  # with the name of the first band
         report("refining", 0.0)
-        return aligned_groups(image_groups(starts, sides), lambda group: align(group, report))
+        results: Results = {}
+        for group in image_groups([band.pair for band in self.bands.values()], seeds, sides):
+            results |= align(group, report)
+        return results
 
-    def add(self, starts: Sequence[SeededPair], results: Results) -> None:
-        """Combine the results of some pairs with those of the other bands by MAP estimation, and add the candidates.
+    def add(self, results: Results) -> None:
+        """Combine the results of some bands with those of the other bands by MAP estimation, and add the candidates.
 
         For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not
         replaced by a relief or a displacement field.
         """
-        for (pair, seed), result in zip(starts, results, strict=True):
-            found = self.bands.setdefault(pair.name, BandCandidates(pair, seed))
+        seeds = self._seeds
+        for name, result in results.items():
+            found = self.bands[name]
             found.issue = result if isinstance(result, Issue) else None
             if found.refined is None or found.issue is None:
-                found.refined = RefinedBand.of(pair, seed, result)
+                found.refined = RefinedBand.of(found.pair, seeds[name], result)
         use = self.settings.relief.use if self._may_be_homography else "never"
         bands = self._combined()
-        self.progress(starts[0][0].name if starts else "", "relief", 0.0)
+        self.progress(next(iter(results), ""), "relief", 0.0)
         reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
         self.reliefs += reliefs
         under = set.intersection(*map(set, self.reliefs)) if self.reliefs else set()  # whichever of them is chosen
-        new = {pair.name for pair, _ in starts} | {name for name, band in self.bands.items() if not band.candidates}
+        new = {*results} | {name for name, band in self.bands.items() if not band.candidates}
         for band in bands:
             name = band.pair.name
             if name in new - under and self.bands[name].issue is None:
@@ -305,11 +310,3 @@ class CaptureEstimation:
 def is_retrieved(result: JointResult | Issue) -> bool:
     """Return True if the descriptors distinguish held-out patches."""
     return isinstance(result, JointResult) and result.is_retrieved
-
-
-def aligned_groups(groups: Sequence[tuple[list[int], ImageGroup]], align: Callable[[ImageGroup], Results]) -> Results:
-    """Align groups of images, each with the indices of its pairs; return the results in the order of the pairs."""
-    results: dict[int, JointResult | Issue] = {}
-    for indices, group in groups:
-        results |= zip(indices, align(group), strict=True)
-    return [results[i] for i in sorted(results)]

@@ -1,6 +1,6 @@
 """Initial alignment (seed) of a pair: candidates from tags, flight and landmarks are scored on the images."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +23,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.verify.checks import seed_fits
 
-SeededPair = tuple[BandPair, Seed]
-"""A pair with its initial alignment."""
 _MIN_OVERLAP = 0.2
 """Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small
 overlaps."""
@@ -92,16 +90,15 @@ def _best_match(pair: BandPair, best: Seed) -> Seed:
     return best
 
 
-def corrected(start: SeededPair) -> SeededPair | None:
-    """Return a pair with its seed corrected by windows: the scale of tags may be wrong by several px at the corners.
+def corrected(pair: BandPair, seed: Seed) -> Seed | None:
+    """Return the seed of a pair corrected by windows: the scale of tags may be wrong by several px at the corners.
 
     None if the windows do not determine a correction, or if it does not fit them better.
     """
-    pair, seed = start
     given, *others = _with_corrected(pair, seed.fixed_to_moving)
     for other in others:
         if seed_fits(other.residual) and other.is_better_than(given):
-            return pair, replace(seed, fixed_to_moving=other.mapping.fixed_to_moving)
+            return replace(seed, fixed_to_moving=other.mapping.fixed_to_moving)
     return None
 
 
@@ -159,25 +156,24 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     return matching_network(model.net, model.side(pair.name) or 1, channels)
 
 
-def image_groups(starts: Sequence[SeededPair], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:
-    """Group the pairs with the same reference image and space for the joint method.
+def image_groups(
+    pairs: Iterable[BandPair], seeds: Mapping[str, Seed], sides: Mapping[str, int] | None = None
+) -> list[ImageGroup]:
+    """Group the images of the pairs that have a seed by reference image and space, as input of the joint method.
 
-    Returns the indices of the pairs and the images of each group. `sides` are the network's sides of the pairs, by
-    default 1, 2, … in each group.
+    `seeds` and the network's `sides` are by band; by default, the sides are 1, 2, … in each group.
     """
-    groups: dict[tuple[int, Space], list[int]] = {}
-    for index, (pair, _) in enumerate(starts):
-        groups.setdefault((id(pair.reference), pair.space), []).append(index)
-    result = []
-    for indices in groups.values():
-        of_group = [starts[i] for i in indices]
-        of_sides = [sides[i] for i in indices] if sides else range(1, len(indices) + 1)
-        moving = [
-            MovingImage(pair.moving, seed.fixed_to_moving, side, seed.trusted, pair.max_shift_px, pair.field)
-            for (pair, seed), side in zip(of_group, of_sides, strict=True)
-        ]
-        result.append((indices, ImageGroup(of_group[0][0].fixed, moving)))
-    return result
+    groups: dict[tuple[int, Space], list[BandPair]] = {}
+    for pair in pairs:
+        if pair.name in seeds:
+            groups.setdefault((id(pair.reference), pair.space), []).append(pair)
+
+    def moving(pair: BandPair, number: int) -> MovingImage:
+        seed, side = seeds[pair.name], number if sides is None else sides[pair.name]
+        state = pair.moving, seed.fixed_to_moving, side, seed.trusted
+        return MovingImage(*state, pair.max_shift_px, pair.field, name=pair.name)
+
+    return [ImageGroup(g[0].fixed, [moving(pair, k) for k, pair in enumerate(g, 1)]) for g in groups.values()]
 
 
 def best_seed(pair: BandPair, matrices: SeedMatrices, force: SeedKind | None = None) -> Seed:

@@ -130,7 +130,7 @@ def _learned_on_pair(
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
     pair = BandPair("moving", Reference(fixed), moving, {"user": start})
     seed = best_seed(pair, pair.seed_matrices) if seeding else Seed("user", start, 0.0)
-    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([(pair, seed)])
+    state, [group] = JointState(settings, lambda *_: None), image_groups([pair], {pair.name: seed})
     try:
         if settings.recipe == "paper":
             net, result = align_by_paper(state, group)

@@ -26,8 +26,8 @@ from agalign.method.state import ImageGroup, JointState, MovingImage, Progress
 from agalign.values.alignment import JointResult
 from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
 
-Results = list[JointResult | Issue]
-"""The result for each moving image of a group, or the reason why there is none."""
+Results = dict[str, JointResult | Issue]
+"""The result for each moving image by its name, or the reason why there is none."""
 
 
 def align_from_scratch(
@@ -45,17 +45,18 @@ def align_from_scratch(
     """
     state = JointState(settings, progress)
     if settings.recipe == "paper":
-        pairs = (ImageGroup(group.fixed, [MovingImage(m.raster, m.fixed_to_moving)]) for m in group.moving)
-        return [_by_paper(state, pair, training) for pair in pairs]
+        pairs = {m.name: ImageGroup(group.fixed, [MovingImage(m.raster, m.fixed_to_moving)]) for m in group.moving}
+        return {name: _by_paper(state, pair, training) for name, pair in pairs.items()}
     net = state.fast_descriptor([group.fixed.channels, *(moving.raster.channels for moving in group.moving)])
     try:
         steps, loss = learn(state, [group], net, schedule=schedule)
         results = refine(state, net, group)
     except NoContrastError:
-        return [Issue(NO_CONTRAST)] * len(group.moving)
-    return [
-        r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps, recipe=settings.recipe) for r in results
-    ]
+        return {m.name: Issue(NO_CONTRAST) for m in group.moving}
+    return {
+        m.name: r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps, recipe=settings.recipe)
+        for m, r in zip(group.moving, results, strict=True)
+    }
 
 
 def refine_with(
@@ -65,8 +66,11 @@ def refine_with(
     try:
         results = refine(JointState(settings, progress), net, group, patches=patches)
     except NoContrastError:
-        return [Issue(NO_CONTRAST)] * len(group.moving)
-    return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
+        return {m.name: Issue(NO_CONTRAST) for m in group.moving}
+    return {
+        m.name: r if isinstance(r, Issue) else replace(r, recipe="flight")
+        for m, r in zip(group.moving, results, strict=True)
+    }
 
 
 def _by_paper(state: JointState, pair: ImageGroup, training: Training) -> JointResult | Issue:

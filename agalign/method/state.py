@@ -35,6 +35,8 @@ class MovingImage:
     dropped_at: float | None = None
     """Held-out retrieval at a level where the descriptors cannot distinguish the patches. The image is neither trained
     on nor refined further."""
+    name: str = ""
+    """Name of the band, if several images are aligned together."""
 
 
 @dataclass(frozen=True)

@@ -276,7 +276,8 @@ def verified_together(bands: Sequence[RefinedBand], settings: Settings) -> dict[
 
 def add(estimation: CaptureEstimation, bands: Sequence[RefinedBand]) -> None:
     """Add the results of bands to those of a capture."""
-    estimation.add([(b.pair, seed_of(b.pair)) for b in bands], [b.joint for b in bands])
+    estimation.bands |= {b.pair.name: BandCandidates(b.pair, seed_of(b.pair)) for b in bands}
+    estimation.add({b.pair.name: b.joint for b in bands})
 
 
 @pytest.mark.full
@@ -352,7 +353,7 @@ def test_the_relief_is_estimated_once_if_nothing_is_learned(
     seeds = {band.pair.name: seed_of(band.pair) for band in candidates}
     monkeypatch.setattr(_Estimate, "of", classmethod(counted))
     monkeypatch.setattr(align_bands, "find_seed", lambda pair, *_: seeds[pair.name])
-    monkeypatch.setattr(CaptureEstimation, "_optimised", lambda _, starts, *__: [joints[p.name] for p, _ in starts])
+    monkeypatch.setattr(CaptureEstimation, "_optimised", lambda _, seeds, *__: {n: joints[n] for n in seeds})
     model = SimpleNamespace(net=None, rig=None, side=lambda _: 0)
     result = CaptureEstimation(Settings(), model, quiet).align(
         [band.pair for band in candidates], Capture("a", Path(), (), 0)

@@ -6,13 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agalign.batch.capture_task import quiet
 from agalign.capture import candidate as module
-from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import RefinedBand, mapping_error
+from agalign.capture.candidate import BandCandidates, RefinedBand, mapping_error
 from agalign.capture.warped_pair import WarpedPair
-from agalign.config import Settings
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
@@ -21,7 +18,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import INACCURATE, REPEATS, RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField
 
-from ..builders import decided, displaced_views, joint_result, pair_of, texture, two_views, whole
+from ..builders import decided, displaced_views, estimation_of, joint_result, pair_of, texture, two_views, whole
 
 TRUTH = geometry.translation(6, -4)
 SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
@@ -137,9 +134,9 @@ def displaced_pair(height_px: float, wavelength_px: float | None = None) -> Band
 
 def test_a_later_optimisation_without_a_result_does_not_replace_an_earlier_one() -> None:
     """The band still takes part in the estimation of the others."""
-    estimation, start = CaptureEstimation(Settings(), None, quiet), (displaced_pair(0.0), CENTRED)
+    estimation = estimation_of(BandCandidates(displaced_pair(0.0), CENTRED))
     for result in (joint_result(), Issue(RETRIEVAL, 0.0, 0.2)):
-        estimation.add([start], [result])
+        estimation.add({"moving": result})
     (band,) = estimation.refined
     assert band.joint.retrieval == joint_result().retrieval
     assert estimation.bands["moving"].issue is not None

@@ -60,13 +60,13 @@ def test_windows_correct_the_scale_of_a_seed() -> None:
     truth = geometry.compose(geometry.translation(6.0, -4.0), np.diag([1.012, 1.012, 1.0]))
     pair = pair_of(*two_views(truth, 800, 640))
     seed = Seed("rig", geometry.translation(6.0, -4.0), 50.0, trusted=True)
-    again = corrected((pair, seed))
+    again = corrected(pair, seed)
     assert again is not None
-    assert again[1].kind == "rig"
+    assert again.kind == "rig"
     assert geometry.corner_error_px(seed.fixed_to_moving, truth, 800, 640) > 5
-    assert geometry.corner_error_px(again[1].fixed_to_moving, truth, 800, 640) < 0.5
+    assert geometry.corner_error_px(again.fixed_to_moving, truth, 800, 640) < 0.5
     unrelated = pair_of(texture(seed=5), texture(seed=6))
-    assert corrected((unrelated, seed)) is None
+    assert corrected(unrelated, seed) is None
 
 
 def test_unrelated_images_have_no_trusted_seed_and_no_common_landmarks() -> None:

@@ -104,7 +104,7 @@ def test_a_gpu_gives_the_result_of_the_cpu(
         rgb, band = whole(np.stack([fixed, 0.5 * fixed, -fixed]), lens), whole(moving, lens)
         seed, settings = geometry.translation(7.0, -5.0), JointSettings(recipe=recipe, device=name)
         group = ImageGroup(rgb, [MovingImage(band, seed, max_shift_px=9.0, field=field)])
-        (result,) = align_from_scratch(group, settings, lambda *_: None, **short)
+        (result,) = align_from_scratch(group, settings, lambda *_: None, **short).values()
         assert result.iterations > 0
         return result
 

@@ -34,7 +34,8 @@ def scratch(
     **settings: Any,
 ) -> JointResult | Issue:
     group = ImageGroup(fixed, [MovingImage(moving, seed, trusted=trusted)])
-    return align_from_scratch(group, JointSettings(**settings), lambda *_: None, training=training)[0]
+    (result,) = align_from_scratch(group, JointSettings(**settings), lambda *_: None, training=training).values()
+    return result
 
 
 def error_px(result: JointResult, truth: np.ndarray = TRUTH) -> float:

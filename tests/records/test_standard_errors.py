@@ -66,9 +66,9 @@ def estimate_and_write(
 ) -> None:
     """Write a capture whose bands have these homographies, but one that is lost and that a rig predicts."""
 
-    def results(_: CaptureEstimation, starts: Any, *__: object) -> list[JointResult]:
-        known = {pair.name: joint_result(planes[pair.name], covariance=1e-3 * np.eye(8)) for pair, _ in starts}
-        return [replace(j, retrieval=0.0) if name == lost else j for name, j in known.items()]
+    def results(_: CaptureEstimation, seeds: Any, *__: object) -> dict[str, JointResult]:
+        known = {name: joint_result(planes[name], covariance=1e-3 * np.eye(8)) for name in seeds}
+        return {name: replace(j, retrieval=0.0) if name == lost else j for name, j in known.items()}
 
     def predictions(estimation: CaptureEstimation, *_: object) -> dict[str, RigPrediction]:
         parallax, prediction = estimation.decided()["NIR"].mapping.parallax, Prediction(planes[lost], "bands", 0.3)
