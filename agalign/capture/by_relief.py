@@ -266,7 +266,7 @@ def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
         issues = [issue for issue in candidate.issues if issue.kind not in BY_PARALLAX]
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
-            result[band.name] = replace(candidate, ignored=BY_PARALLAX)
+            result[band.name] = replace(candidate, given_issues=())
     return result if _fits_better(bands, result) else {}
 
 

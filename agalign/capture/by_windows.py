@@ -77,11 +77,11 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
         return None
     mapping, fit = fitted
     warped = WarpedPair.of(pair, mapping, windows)
-    if warped.alias_peak().ratio > MAX_ALIAS_PEAK:
+    if warped.alias_peak.ratio > MAX_ALIAS_PEAK:
         return None
     error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, mapping.field)
     evidence = warped.residual, band.joint, warped
-    return Candidate(pair, mapping, error, *evidence, inherited_issues=band.rejected)
+    return Candidate(pair, mapping, error, *evidence, given_issues=band.rejected)
 
 
 def _is_consistent(fit: WindowFit) -> bool:

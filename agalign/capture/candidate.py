@@ -15,7 +15,7 @@ from agalign.values.alignment import BY_WINDOWS, JointResult, Seed
 from agalign.values.choices import Geometry, ReliefUse, SeedKind
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
-from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
+from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, UNREADABLE, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
@@ -45,10 +45,10 @@ class Candidate:
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     refined_from: "Candidate | None" = None
     """The candidate that it refines."""
-    ignored: frozenset[IssueKind] = frozenset()
-    """Kinds of issues that do not matter: those by parallax, in an observation of the rig."""
-    inherited_issues: tuple[Issue, ...] = ()
-    """Issues of an earlier candidate that remain: it is a prediction, as windows see a part of the image only."""
+    given_issues: tuple[Issue, ...] | None = None
+    """Its issues, instead of those that the checks find: of an earlier candidate that remain, as windows see a part of
+    the image only; none in an observation of the rig, for which some issues do not matter.
+    """
 
     @classmethod
     def of(cls, warped: WarpedPair, joint: JointResult, residual: Residual | None = None) -> "Candidate":
@@ -62,26 +62,25 @@ class Candidate:
     @cached_property
     def issues(self) -> tuple[Issue, ...]:
         """What the checks find; empty if it passes verification."""
-        if self.inherited_issues:
-            return self.inherited_issues
+        if self.given_issues is not None:
+            return self.given_issues
         pixel_px = self.pair.file_pixel_size_px
         found = issues_of(self.mapping, self.error, self.residual, self.joint, self.common_px, pixel_px)
-        found = found or self._issues_of_pixels
-        issues = tuple(issue for issue in found if issue.kind not in self.ignored)
+        issues = found or self._issues_of_pixels
         if issues or self.other_residual is None:
             return issues
         error = replace(self.error, residual=self.other_residual)
         return replace(self, residual=self.other_residual, error=error, other_residual=None).issues
 
-    @cached_property
+    @property
     def _issues_of_pixels(self) -> tuple[Issue, ...]:
         """What the checks of pixels find, which are costly."""
-        return () if self.images is None else self.images.issues()
+        return () if self.images is None else self.images.issues
 
     @property
     def may_predict(self) -> bool:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
-        found = () if self.inherited_issues else (*self.issues, *self._issues_of_pixels)
+        found = (*self.issues, *self._issues_of_pixels) if self.given_issues is None else ()
         return all(issue.kind in PREDICTED_WITH for issue in found) and math.isfinite(self.std_px)
 
     @cached_property
@@ -105,7 +104,7 @@ class Candidate:
     def common_px(self) -> Points:
         """Points (n, 2) of a grid over the reference that the moving image covers."""
         if self.images is not None:
-            return self.images.common_px()
+            return self.images.common_px
         if self.refined_from is not None:
             return self.refined_from.common_px
         return points_in_frame(self.mapping, *self.pair.sizes_px)

@@ -1,7 +1,7 @@
 """A band pair on one grid: the moving image under a mapping, and the residual of its windows."""
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -82,24 +82,27 @@ class WarpedPair:
         halves = (replace(self.mapping, fixed_to_moving=matrix) for matrix in by_halves)
         return replace(self, residual=held_out_residual(self.residual, self.mapping, *halves))
 
+    @cached_property
     def alias_peak(self) -> AliasPeak:
-        """Return the highest correlation peak of the reduced images after that of the mapping."""
+        """The highest correlation peak of the reduced images after that of the mapping."""
         reference = self.pair.reference
         moving = windowed_spectra(structure_field(shrink(self.warped, reference.seed_size_px)))
         return alias_peak(reference.seed_spectrum, moving, reference.seed_scale)
 
+    @cached_property
     def issues(self) -> tuple[Issue, ...]:
-        """Return what the checks of the pixels find."""
+        """What the checks of the pixels find."""
         usual = self.pair.windows  # they cover the image once
         residual = self.residual if self.windows is usual else usual.residuals(self.warped)
         is_expected = partial(self.pair.is_expected, self.mapping.fixed_to_moving)
         return (
             *content_issues(residual, self.pair.file_pixel_size_px),
-            *repetition_issues(self.alias_peak(), is_expected),
+            *repetition_issues(self.alias_peak, is_expected),
         )
 
+    @cached_property
     def common_px(self) -> Points:
-        """Return the points (n, 2) of a grid over the reference that the moving image covers.
+        """The points (n, 2) of a grid over the reference that the moving image covers.
 
         Georeferenced rasters have areas without data, which do not count; the image of a camera is complete.
         """

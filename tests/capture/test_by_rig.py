@@ -211,7 +211,7 @@ def test_a_more_accurate_prediction_by_windows_is_kept(first: Estimated) -> None
         matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
         mapping = replace(nir.mapping, fixed_to_moving=matrix).without_parallax
         error = MappingError(pair.fixed.size_px, std_px**2 / 2 * np.eye(8))
-        of_windows = Candidate(pair, mapping, error, nir.residual, nir.joint, inherited_issues=issues)
+        of_windows = Candidate(pair, mapping, error, nir.residual, nir.joint, given_issues=issues)
         checked = first.with_nir(of_windows).predicted()["NIR"]
         assert (checked.status, checked.prediction.source) == ("predicted", source)
 

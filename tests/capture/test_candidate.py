@@ -45,7 +45,7 @@ def aligned(
 
 def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     """These checks are costly."""
-    monkeypatch.setattr(WarpedPair, "issues", lambda _: (Issue(REPEATS, 16.0),))
+    monkeypatch.setattr(WarpedPair, "issues", (Issue(REPEATS, 16.0),))
     warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
     unretrieved = module.Candidate.of(warped_pair, replace(GOOD, retrieval=0.0))
     assert [issue.kind for issue in unretrieved.issues] == [RETRIEVAL]
@@ -57,7 +57,7 @@ def test_a_further_issue_never_improves_a_status(pair: BandPair, monkeypatch: py
     warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
     inaccurate = replace(GOOD, corner_std_xy_px=((3.0, 3.0),) * 4)
     for found, may_predict in (((), True), ((Issue(REPEATS, 16.0),), False)):
-        monkeypatch.setattr(WarpedPair, "issues", lambda _, found=found: found)
+        monkeypatch.setattr(WarpedPair, "issues", found)
         candidate = module.Candidate.of(warped_pair, inaccurate)
         assert [issue.kind for issue in candidate.issues] == [INACCURATE]
         assert candidate.may_predict is may_predict

@@ -69,7 +69,7 @@ def candidate(
 
 def in_part(std_px: float = 0.05, issue: Issue = IN_PART, **facts: object) -> Candidate:
     """A mapping that the images confirm in a part of the image."""
-    return candidate(std_px=std_px, inherited_issues=(issue,), **facts)
+    return candidate(std_px=std_px, given_issues=(issue,), **facts)
 
 
 def unconfirmed(**facts: object) -> Candidate:
@@ -229,7 +229,7 @@ def relief_of(*names: str, predicted: Mapping[str, float] | None = None) -> Unde
     relief = flat_relief()
     found = {n: candidate(n, relief=relief) for n in names}
     return found | {
-        n: candidate(n, relief=relief, std_px=s, inherited_issues=(IN_PART,)) for n, s in (predicted or {}).items()
+        n: candidate(n, relief=relief, std_px=s, given_issues=(IN_PART,)) for n, s in (predicted or {}).items()
     }
 
 

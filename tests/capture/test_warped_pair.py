@@ -81,6 +81,6 @@ def test_the_common_area_of_georeferenced_files_has_their_pixels_without_texture
         image.pixels[:, 320:] = image.pixels.mean()
     valid = np.arange(640) >= 64
     pair = pair_of(replace(fixed, valid=fixed.valid & valid), moving, {"geo": np.eye(3)})
-    common_px = WarpedPair.of(pair, pair.mapping(np.eye(3))).common_px()
+    common_px = WarpedPair.of(pair, pair.mapping(np.eye(3))).common_px
     assert 64 <= common_px[:, 0].min() < 100
     assert common_px[:, 0].max() > 600

@@ -164,7 +164,7 @@ def test_a_band_is_delivered_by_the_standard_error_that_is_written(
     pair = pair_of(texture(64, 48), texture(64, 48))
     mapping, error = pair.mapping(np.eye(3)), MappingError((64, 48), rig_std_px=std_px)
     windows, issue = residual_of(np.zeros((4, 2)), (0.0, 0.0)), Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px")
-    candidate = Candidate(pair, mapping, error, windows, joint_result(), inherited_issues=(issue,))
+    candidate = Candidate(pair, mapping, error, windows, joint_result(), given_issues=(issue,))
     estimated = decided(pair, Seed("rig", np.eye(3), 30.0), [candidate])
     reference, nir = (Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("Green", "NIR"))
     capture = Capture("a", Path(), (reference, nir), 0)
