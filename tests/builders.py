@@ -73,9 +73,8 @@ def estimation_of(band: BandCandidates, refined: RefinedBand | None = None) -> C
 def fitted_to_windows(band: BandCandidates, refined: RefinedBand | None = None) -> Alignment:
     """The alignment of a band after the estimators that are fitted to windows."""
     estimation = estimation_of(band, refined)
-    estimation._fit_windows()
-    estimation._add_errors_of_relief()
-    return estimation.decided()[band.pair.name]
+    result = estimation._fit_windows(estimation.decided())
+    return estimation._add_errors_of_relief(result)[band.pair.name]
 
 
 def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, sigma: float = 20.0) -> Residual:

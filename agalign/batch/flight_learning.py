@@ -191,7 +191,7 @@ class _FlightLearner:
         with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return list(pool.map(lambda capture: capture.refined_by(net, settings), loaded))
+                return list(pool.map(lambda capture: capture.refined_by(net), loaded))
         return []
 
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> list[LearningCapture]:

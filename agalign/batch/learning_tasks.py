@@ -80,9 +80,9 @@ class LearningCapture:
     """True if all bands that could be read are aligned."""
 
     @classmethod
-    def of(cls, capture: Capture, pairs: Sequence[BandPair], estimation: CaptureEstimation) -> "LearningCapture":
+    def of(cls, capture: Capture, estimation: CaptureEstimation) -> "LearningCapture":
         """Collect the results for the pairs of a capture."""
-        result = estimation.decided()
+        result, pairs = estimation.decided(), [band.pair for band in estimation.bands.values()]
         in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
         observation = observed(pairs, result, capture)
@@ -106,33 +106,30 @@ class LearningCapture:
 
 @dataclass(frozen=True)
 class LoadedCapture:
-    """The images of a capture to learn the network from, and their seeds."""
+    """The images of a capture to learn the network from."""
 
     capture: Capture
-    pairs: list[BandPair]
-    seeds: dict[str, Seed]
-    """By band."""
+    estimation: CaptureEstimation
+    """With the seeds, as an observation of the rig."""
     groups: list[ImageGroup]
 
     @property
     def similarity_sigma(self) -> float:
         """Median height of the correlation peaks of the seeds, in standard deviations."""
-        return float(np.median([seed.peak_sigma for seed in self.seeds.values()]))
+        return float(np.median([seed.peak_sigma for seed in self.estimation.seeds.values()]))
 
     @property
     def is_trusted(self) -> bool:
         """True if all seeds are confirmed by the images."""
-        return all(seed.trusted for seed in self.seeds.values())
+        return all(seed.trusted for seed in self.estimation.seeds.values())
 
-    def refined_by(self, net: Descriptor, settings: Settings) -> LearningCapture:
+    def refined_by(self, net: Descriptor) -> LearningCapture:
         """Refine the pairs by a network and verify them, as observations of the rig; return them without images."""
         results: Results = {}
-        bands = {pair.name: BandCandidates(pair, self.seeds[pair.name]) for pair in self.pairs}
-        estimation = CaptureEstimation(settings, None, quiet, is_observation=True, bands=bands)
         for group in self.groups:
-            results |= refine_with(net, group, settings.joint, quiet, FLIGHT_PATCHES)
-        estimation.add(results)
-        return LearningCapture.of(self.capture, self.pairs, estimation)
+            results |= refine_with(net, group, self.estimation.settings.joint, quiet, FLIGHT_PATCHES)
+        self.estimation.add(results)
+        return LearningCapture.of(self.capture, self.estimation)
 
 
 def load_capture(
@@ -149,14 +146,15 @@ def load_capture(
     """
     with logged_failure(f"{capture.label} cannot be learned from"):
         pairs = [p for p in _pairs_of(capture, settings) if p.has_rig_pixels]
-        found = {p.name: known[p.name].seed if p.name in known else find_seed(p, settings.seed, start) for p in pairs}
-        seeds = {name: seed for name, seed in found.items() if isinstance(seed, Seed)}
-        if seeds:
-            groups = image_groups(pairs, seeds, {name: bands.index(name) + 1 for name in seeds})
+        found = [(p, known[p.name].seed if p.name in known else find_seed(p, settings.seed, start)) for p in pairs]
+        usable = {p.name: BandCandidates(p, seed) for p, seed in found if isinstance(seed, Seed)}
+        if usable:
+            estimation = CaptureEstimation(settings, None, quiet, is_observation=True, bands=usable)
+            groups = image_groups(pairs, estimation.seeds, {name: bands.index(name) + 1 for name in usable})
             for moving in (image for group in groups for image in group.moving):
                 if moving.name in known and known[moving.name].result.is_retrieved:
                     moving.fixed_to_moving = known[moving.name].result.fixed_to_moving
-            return LoadedCapture(capture, [p for p in pairs if p.name in seeds], seeds, groups)
+            return LoadedCapture(capture, estimation, groups)
     return None
 
 
@@ -196,7 +194,7 @@ def choose_and_refine(
     if best is None:
         return None
     with logged_failure(f"{best.capture.label} cannot be learned from"):
-        return best.refined_by(initial_network(bands, settings, start), settings)
+        return best.refined_by(initial_network(bands, settings, start))
     return None
 
 
@@ -206,5 +204,5 @@ def observe_rig(model: FlightModel, settings: Settings, capture: Capture) -> Lea
         pairs = [p for p in _pairs_of(capture, settings, model) if p.has_rig_pixels]
         estimation = CaptureEstimation(settings, _on_device(model, settings), quiet, is_observation=True)
         estimation.align(pairs, None, scratch=False)
-        return LearningCapture.of(capture, pairs, estimation)
+        return LearningCapture.of(capture, estimation)
     return None

@@ -7,23 +7,24 @@ from functools import partial
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import UnderRelief, by_relief
-from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, bands_to_learn, observed, rig_predictions
+from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, observed, rig_predictions
 from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is_extrapolated, spreads_of_relief_px
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
-from agalign.capture.full_resolution import at_full_resolution
+from agalign.capture.full_resolution import at_full_resolution, is_reduced
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.metrics import with_metrics
 from agalign.capture.seeding import corrected, find_seed, image_groups
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
+from agalign.flight.rig import Rig
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
 from agalign.pixels.raster import ReadTile
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Alignments, JointResult, Seed, relief_of
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Alignments, JointResult, Seed, relief_of
 from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
@@ -33,6 +34,8 @@ from agalign.values.residual import Residual
 
 PairProgress = Callable[[str, str, float], None]
 """Called with the name of the band, the stage and its completed share, 0 to 1."""
+_Align = Callable[[ImageGroup, Progress], Results]
+"""Optimises the mappings of a group of images."""
 
 
 def align_capture_bands(
@@ -138,15 +141,16 @@ class CaptureEstimation:
         if self.settings.seed.only:
             return self.decided()
         self._refine()
-        self._learn(capture, scratch=scratch)
-        self._fit_windows()
+        result = self._learn(self.decided(), capture, scratch=scratch)
+        result = self._fit_windows(result)
         if self.is_observation:
-            return self.decided()
-        self._add_errors_of_relief()
+            return result
+        result = self._add_errors_of_relief(result)
         if capture is None:
-            return self.decided()
-        self._refine_on_files(capture)
-        return self.decided(self._predictions(pairs, capture))
+            return result
+        result = self._refine_on_files(result, capture)
+        predictions = self._predictions(pairs, result, capture)
+        return self.decided(predictions) if predictions else result
 
     def decided(self, predictions: Mapping[str, RigPrediction] | None = None) -> Alignments:
         """Return the alignments by what has been found."""
@@ -161,7 +165,7 @@ class CaptureEstimation:
             self.bands[pair.name] = BandCandidates(pair, seed, Issue(SEED_ASKED_FOR) if is_asked_for else None)
 
     @property
-    def _seeds(self) -> dict[str, Seed]:
+    def seeds(self) -> dict[str, Seed]:
         """The seeds of the bands that have one."""
         return {name: band.seed for name, band in self.bands.items() if isinstance(band.seed, Seed)}
 
@@ -176,84 +180,77 @@ class CaptureEstimation:
         def refined(group: ImageGroup, report: Progress) -> Results:
             return refine_with(model.net, group, self.settings.joint, report, patches)
 
-        seeds = {name: seed for name, seed in self._seeds.items() if name in sides}
+        seeds = {name: seed for name, seed in self.seeds.items() if name in sides}
         results = self._optimised(seeds, refined, sides)
         # Tags may have the wrong scale: descriptors that do not align a seed may align it once windows correct it.
-        again = {
-            name: other
-            for name, seed in seeds.items()
-            if not is_retrieved(results[name]) and (other := corrected(self.bands[name].pair, seed)) is not None
-        }
+        lost = {name: seed for name, seed in seeds.items() if not is_retrieved(results[name])}
+        other_seeds = {name: corrected(self.bands[name].pair, seed) for name, seed in lost.items()}
+        again = {name: seed for name, seed in other_seeds.items() if seed is not None}
         others = self._optimised(again, refined, sides)
         self.add(results | {name: result for name, result in others.items() if is_retrieved(result)})
 
-    def _learn(self, capture: Capture | None, *, scratch: bool) -> None:
-        """Align pairs with networks that are learned from scratch."""
-        result, seeds = self.decided(), self._seeds
+    def _learn(self, result: Alignments, capture: Capture | None, *, scratch: bool) -> Alignments:
+        """Align bands with networks that are learned from scratch; return the alignments then."""
+        seeds = self.seeds
         done = {b.pair.name for b in self.refined if not scratch or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
         remaining = {name: seed for name, seed in seeds.items() if name not in done}
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
             names = bands_to_learn([self.bands[name].pair for name in seeds], result, rig, capture)
             remaining = {name: seed for name, seed in remaining.items() if name in names}
-        if remaining:
-            joint = self.settings.joint
-            self.add(self._optimised(remaining, lambda group, report: align_from_scratch(group, joint, report)))
+        if not remaining:
+            return result
+        joint = self.settings.joint
+        self.add(self._optimised(remaining, lambda group, report: align_from_scratch(group, joint, report)))
+        return self.decided()
 
-    def _fit_windows(self) -> None:
-        """Fit windows alone where the descriptors have no result."""
-        if not self._may_be_homography:
-            return
-        for name, alignment in self.decided().items():
-            band = self.bands[name]
-            if alignment.status in ("aligned", "predicted"):
-                continue
+    def _fit_windows(self, result: Alignments) -> Alignments:
+        """Fit windows alone where the descriptors have no result; return the alignments then."""
+        lost = [self.bands[name] for name, a in result.items() if a.status not in ("aligned", "predicted")]
+        if not (lost and self._may_be_homography):
+            return result
+        for band in lost:
             by_windows = fitted_to_windows(band)
             if by_windows is None or not by_windows.may_predict:
                 by_windows = agreeing_with_seed(band)
             band.candidates += [] if by_windows is None else [by_windows]
+        return self.decided()
 
-    def _add_errors_of_relief(self) -> None:
-        """Add the relief that homographies lack to their errors, where no window is near.
+    def _add_errors_of_relief(self, result: Alignments) -> Alignments:
+        """Add the relief that homographies lack to their errors, where no window is near; return the alignments then.
 
         Bands that pass without it keep their errors: with it, those of flat fields would be 0.3 to 0.45 px where the
         true ones are 0.1 px.
         """
-        if not self._may_be_homography:
-            return
+        rejected = [band for band in self.bands.values() if band.candidates and not band.accepted]
+        extrapolated = [band for band in rejected if is_extrapolated(band.candidates[-1])]
+        if not (extrapolated and self._may_be_homography):
+            return result
         known = {b.pair.name: b.joint.fixed_to_moving for b in self.refined if b.joint.is_retrieved}
         spreads_px = spreads_of_relief_px([band.pair for band in self.bands.values()], known)
-        for name, band in self.bands.items():
-            if band.candidates and not band.accepted and is_extrapolated(band.candidates[-1]):
-                band.candidates = [c.with_relief_std_px(spreads_px[name]) for c in band.candidates]
+        for band in extrapolated:
+            band.candidates = [c.with_relief_std_px(spreads_px[band.pair.name]) for c in band.candidates]
+        return self.decided()
 
-    def _predictions(self, pairs: Sequence[BandPair], capture: Capture) -> dict[str, RigPrediction]:
+    def _predictions(self, pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> dict[str, RigPrediction]:
         """Return the predictions of the rig of the flight from the aligned bands of the capture."""
         rig = None if self.model is None else self.model.rig
-        if rig is None:
-            return {}
-        result = self.decided()
-        return rig_predictions(pairs, result, rig, observed(pairs, result, capture))
+        return {} if rig is None else rig_predictions(pairs, result, rig, observed(pairs, result, capture))
 
-    def _refine_on_files(self, capture: Capture) -> None:
-        """Refine aligned bands on tiles of the files, if these have more pixels than the images."""
-        result = self.decided()
-        for name, band in self.bands.items():
-            is_wanted = band.pair.is_reduced and band.accepted and result[name].mapping.parallax is None
-            if not is_wanted or result[name].status != "aligned":
-                continue
+    def _refine_on_files(self, result: Alignments, capture: Capture) -> Alignments:
+        """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
+        aligned = {name: alignment for name, alignment in result.items() if alignment.status == "aligned"}
+        planes = [self.bands[name] for name, alignment in aligned.items() if alignment.mapping.parallax is None]
+        reduced = [band for band in planes if is_reduced(band.pair)]
+        for band in reduced:
             refined = at_full_resolution(capture.reference, band.accepted[-1])
             if isinstance(refined, Issue):
                 band.issue, band.candidates = refined, []
             elif refined is not None:
                 band.candidates.append(refined)
+        return self.decided() if reduced else result
 
-    def _optimised(
-        self,
-        seeds: Mapping[str, Seed],
-        align: Callable[[ImageGroup, Progress], Results],
-        sides: Mapping[str, int] | None = None,
-    ) -> Results:
+    def _optimised(self, seeds: Mapping[str, Seed], align: _Align, sides: Mapping[str, int] | None = None) -> Results:
         """Return the results of the bands with these `seeds`, with their `sides` of the network."""
         if not seeds:
             return {}
@@ -270,7 +267,7 @@ class CaptureEstimation:
         For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not
         replaced by a relief or a displacement field.
         """
-        seeds = self._seeds
+        seeds = self.seeds
         for name, result in results.items():
             found = self.bands[name]
             found.issue = result if isinstance(result, Issue) else None
@@ -305,6 +302,28 @@ class CaptureEstimation:
     def _may_be_homography(self) -> bool:
         """False if the user chose a model family with fewer parameters."""
         return self.settings.joint.model_family in ("auto", "homography")
+
+
+def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
+    """Return the bands to learn from scratch if the flight's network did not align them.
+
+    Bands are skipped if the rig predicts them with a standard error of at most DELIVERED_STD_PX, or if they have
+    no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
+    height than those of the flight's network.
+    """
+    predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
+
+    def is_skipped(pair: BandPair) -> bool:
+        alignment = result.get(pair.name)
+        if alignment is None or pair.name not in predictions:
+            return False
+        joint = alignment.joint
+        # Fewer patches than a result needs: a network of its own may retrieve more.
+        is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
+        has_common_structure = alignment.seed.trusted or is_above_chance
+        return not has_common_structure or predictions[pair.name].of_scene.std_px <= DELIVERED_STD_PX
+
+    return {pair.name for pair in pairs if not is_skipped(pair)}
 
 
 def is_retrieved(result: JointResult | Issue) -> bool:

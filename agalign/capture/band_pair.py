@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras.tag_seeds import tag_seeds
-from agalign.capture.reference import Reference
+from agalign.capture.reference import LONGEST_SIDE_PX, Reference, longest_for
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.fit.windows import FixedWindows
@@ -34,12 +34,6 @@ SeedMatrices = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
 _MAX_ERROR_STD = 3.0
 """Maximum error of an initial mapping in standard errors."""
-_LONGEST_SIDE_PX = 2700
-"""Larger images are reduced to this for estimation, which limits memory and time; `full_resolution` refines the result.
-The bands of most cameras have fewer pixels (2592 on the Mavic 3M)."""
-_COARSE_RATIO = 0.4
-"""A moving band is coarse if its magnification relative to the reference is smaller than this; the reference is reduced
-for it."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +68,6 @@ class BandPair:
         """The pixels between which the homographies are: undistorted ones if both lenses are known."""
         both = self.reference.image.lens is not None and self.moving_image.lens is not None
         return "undistorted" if both else "pixel"
-
-    @property
-    def is_reduced(self) -> bool:
-        """True if a refinement on the files is worthwhile, because they have many more pixels than the images."""
-        max_scale = 0.7  # of the images relative to their files
-        return min(*self.scales.moving, *(() if self.is_coarse else self.scales.fixed)) < max_scale
 
     @property
     def file_pixel_size_px(self) -> float:
@@ -195,7 +183,7 @@ def read_pairs(
     The mappings of a flight's `model` precede those of the tags. `read` reads the pixels of the files, by default
     `read_tile`. Raises UnreadableFileError if the reference cannot be read.
     """
-    references = {_LONGEST_SIDE_PX: Reference(read_for_alignment(capture.reference, _LONGEST_SIDE_PX, read))}
+    references = {LONGEST_SIDE_PX: Reference(read_for_alignment(capture.reference, LONGEST_SIDE_PX, read))}
     pairs: list[BandPair] = []
     unusable: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
@@ -207,7 +195,7 @@ def read_pairs(
             unusable |= dict.fromkeys((b.name for b in bands), issue)
             continue
         try:
-            images = [read_for_alignment(b, _LONGEST_SIDE_PX, read) for b in bands]
+            images = [read_for_alignment(b, LONGEST_SIDE_PX, read) for b in bands]
         except AgalignError as error:
             unusable |= dict.fromkeys((b.name for b in bands), Issue(UNREADABLE, detail=str(error)))
             continue
@@ -220,7 +208,7 @@ def read_pairs(
         moving = _mean(_mostly_valid(list(usable.values())))
         pair = _pair(capture.reference, references[longest], longest, bands, moving, matrices, model)
         pairs.append(replace(pair, bands=tuple(b for b in bands if b.name in usable)))
-    return _without_stripes(pairs, references[_LONGEST_SIDE_PX]), unusable
+    return _without_stripes(pairs, references[LONGEST_SIDE_PX]), unusable
 
 
 def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[BandPair]:
@@ -246,7 +234,7 @@ def _pair(
 ) -> BandPair:
     """Create the pair of `reference`, the image of `band` reduced to `longest` px, and the image of `bands`."""
     name = bands[0].name
-    is_coarse = longest < min(_LONGEST_SIDE_PX, max(band.size_px))
+    is_coarse = longest < min(LONGEST_SIDE_PX, max(band.size_px))
     scales = PairScales.of((band.size_px, bands[0].size_px), (reference.image.size_px, moving.size_px))
     reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
     field = None if model is None or model.rig is None else model.rig.fields.get(name)
@@ -258,20 +246,6 @@ def _pair(
         relief_px = rig.parallax_px.get(name, 0.0) * scales.fixed.mean
         pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px)
     return replace(pair, layout=relative_parallax(band, bands[0]))
-
-
-def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
-    """Return the longer side, px, to which the reference is reduced for a moving band.
-
-    It is less than _LONGEST_SIDE_PX for a band with much larger pixels, as of a thermal camera.
-    """
-    ratio = geometry.magnification(fixed_to_moving, *reference.size_px)
-    if not 0 < ratio < _COARSE_RATIO:
-        return _LONGEST_SIDE_PX
-    oversampling = 2.0  # along a line; more pixels of the reference add no common detail
-    min_side_px = 128  # required by the windows
-    side_px = round(oversampling * ratio * max(reference.size_px))
-    return min(_LONGEST_SIDE_PX, max(side_px, min_side_px))
 
 
 def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, float]:

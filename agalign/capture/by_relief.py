@@ -198,7 +198,8 @@ class _Band:
 
     def fitted(self, fit: WindowFit) -> "_Band":
         """Apply a fit to windows. Raises GeometryError."""
-        x, y = self.baseline if fit.baseline is None else fit.baseline.tolist()
+        assert fit.baseline is not None
+        x, y = fit.baseline.tolist()
         return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y), covariance_px2=fit.covariance_px2)
 
     @property

@@ -1,4 +1,4 @@
-"""Predictions of the bands of a capture by the flight's rig: candidates for `decision`; the bands to learn."""
+"""Predictions of the bands of a capture by the flight's rig: candidates for `decision`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px, expected_square
 from agalign.flight.rig_prediction import predict_band
-from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, JointResult, Prediction
+from agalign.values.alignment import Alignments, JointResult, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
@@ -169,25 +169,3 @@ def _parallax_by_rig(
     error = math.sqrt(variance * (2 + float(np.trace(own @ np.linalg.inv(design.T @ design) @ own.T))))
     x, y = (own @ solution).tolist()
     return Parallax(relief, (x, y)).with_occlusions(), error * relief.rms_px
-
-
-def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
-    """Return the bands to learn from scratch if the flight's network did not align them.
-
-    Bands are skipped if the rig predicts them with a standard error of at most DELIVERED_STD_PX, or if they have
-    no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
-    height than those of the flight's network.
-    """
-    predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
-
-    def is_skipped(pair: BandPair) -> bool:
-        alignment = result.get(pair.name)
-        if alignment is None or pair.name not in predictions:
-            return False
-        joint = alignment.joint
-        # Fewer patches than a result needs: a network of its own may retrieve more.
-        is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
-        has_common_structure = alignment.seed.trusted or is_above_chance
-        return not has_common_structure or predictions[pair.name].of_scene.std_px <= DELIVERED_STD_PX
-
-    return {pair.name for pair in pairs if not is_skipped(pair)}

@@ -96,7 +96,7 @@ def _is_consistent(fit: WindowFit) -> bool:
 def is_extrapolated(plane: Candidate) -> bool:
     """Return True for a homography that is only inaccurate, without windows in a quarter of the image."""
     pair = plane.pair
-    if [issue.kind for issue in plane.issues] != [INACCURATE] or plane.mapping.parallax is not None:
+    if [issue.kind for issue in plane.issues] != [INACCURATE]:
         return False
     in_frame_px = points_in_frame(plane.mapping, *pair.sizes_px)
     unobserved = unobserved_quarters(plane.residual.measured_px, pair.fixed.size_px, in_frame_px)

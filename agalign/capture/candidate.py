@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.seeding import seed_to_use
 from agalign.capture.warped_pair import WarpedPair
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import BY_WINDOWS, JointResult, Seed
@@ -266,15 +267,8 @@ class BandCandidates:
 
     @cached_property
     def start(self) -> Seed:
-        """The seed; that of tags or flight if it contradicts them, or if there is none."""
-        matrices, std_px = self.pair.seed_matrices, self.pair.seed_std_px
-        if isinstance(self.seed, Issue):
-            kind, matrix = next(iter(matrices.items()))
-            return Seed(kind, matrix, 0.0)
-        known = min(((std_px[kind], kind) for kind in std_px if kind in matrices), default=None)
-        if known is None or self._is_asked_for or self.pair.is_expected(self.seed.fixed_to_moving):
-            return self.seed
-        return Seed(known[1], matrices[known[1]], 0.0, trusted=True)
+        """The seed that is used."""
+        return seed_to_use(self.pair, self.seed, is_asked_for=self._is_asked_for)
 
     @cached_property
     def at_start(self) -> WarpedPair | None:

@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 
+from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate, mapping_error
 from agalign.errors import UnreadableFileError
 from agalign.fit.window_fit import cross_fitted
@@ -32,6 +33,12 @@ it."""
 
 _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
+
+
+def is_reduced(pair: BandPair) -> bool:
+    """Return True if a refinement on the files is worthwhile, because they have many more pixels than the images."""
+    max_scale = 0.7  # of the images relative to their files
+    return min(*pair.scales.moving, *(() if pair.is_coarse else pair.scales.fixed)) < max_scale
 
 
 def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue | None:

@@ -1,4 +1,4 @@
-"""The reference image of a capture, with cached data for the seeds, checks and metrics of all bands."""
+"""The reference image of a capture, with cached data for the seeds, checks and metrics of all bands, and its size."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -14,9 +14,19 @@ from agalign.fit.windows import (
 from agalign.pixels.band_resampling import channel_mean, shrink, textured
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
+from agalign.values import geometry
+from agalign.values.capture import Band
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.similarity import FixedSimilarity
+
+LONGEST_SIDE_PX = 2700
+"""Larger images are reduced to this for estimation, which limits memory and time; `full_resolution` refines the result.
+The bands of most cameras have fewer pixels (2592 on the Mavic 3M)."""
+COARSE_RATIO = 0.4
+"""A moving band is coarse if its magnification relative to the reference is smaller than this; the reference is reduced
+for it."""
 
 
 class Reference:
@@ -125,3 +135,17 @@ class Reference:
     def similarity(self) -> FixedSimilarity:
         """Histogram bins and gradients for the similarity metrics."""
         return FixedSimilarity(self.grey)
+
+
+def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
+    """Return the longer side, px, to which the reference is reduced for a moving band.
+
+    It is less than LONGEST_SIDE_PX for a band with much larger pixels, as of a thermal camera.
+    """
+    ratio = geometry.magnification(fixed_to_moving, *reference.size_px)
+    if not 0 < ratio < COARSE_RATIO:
+        return LONGEST_SIDE_PX
+    oversampling = 2.0  # along a line; more pixels of the reference add no common detail
+    min_side_px = 128  # required by the windows
+    side_px = round(oversampling * ratio * max(reference.size_px))
+    return min(LONGEST_SIDE_PX, max(side_px, min_side_px))

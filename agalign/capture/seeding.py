@@ -90,6 +90,20 @@ def _best_match(pair: BandPair, best: Seed) -> Seed:
     return best
 
 
+def seed_to_use(pair: BandPair, found: Seed | Issue, *, is_asked_for: bool = False) -> Seed:
+    """Return the seed that was found; that of tags or flight if there is none, or if it contradicts them and the user
+    did not ask for it.
+    """
+    matrices, std_px = pair.seed_matrices, pair.seed_std_px
+    if isinstance(found, Issue):
+        kind, matrix = next(iter(matrices.items()))
+        return Seed(kind, matrix, 0.0)
+    known = min(((std_px[kind], kind) for kind in std_px if kind in matrices), default=None)
+    if known is None or is_asked_for or pair.is_expected(found.fixed_to_moving):
+        return found
+    return Seed(known[1], matrices[known[1]], 0.0, trusted=True)
+
+
 def corrected(pair: BandPair, seed: Seed) -> Seed | None:
     """Return the seed of a pair corrected by windows: the scale of tags may be wrong by several px at the corners.
 

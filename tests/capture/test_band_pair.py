@@ -10,8 +10,10 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import discover
-from agalign.capture.band_pair import _seed_std_px, longest_for, read_pairs
+from agalign.capture.band_pair import _seed_std_px, read_pairs
 from agalign.capture.by_rig import observed
+from agalign.capture.full_resolution import is_reduced
+from agalign.capture.reference import longest_for
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
@@ -126,7 +128,7 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
         assert score.median_px < (0.3 if score.band == "LWIR" else 0.1)
     capture = discover(tmp_path).captures[0]
     pairs, _ = read_pairs(capture, SeedSettings())
-    assert [(p.name, p.is_coarse, p.is_reduced) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
+    assert [(p.name, p.is_coarse, is_reduced(p)) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
     assert 270 < pairs[1].fixed.size_px[0] < 310  # about two pixels per pixel of the thermal band
     assert pairs[1].reference_file_px == (800, 600)
 

@@ -16,10 +16,9 @@ from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import quiet
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
-from agalign.capture.align_bands import CaptureEstimation, align_capture_bands
+from agalign.capture.align_bands import CaptureEstimation, align_capture_bands, bands_to_learn
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import UnderRelief
-from agalign.capture.by_rig import bands_to_learn
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
@@ -117,7 +116,7 @@ class Estimated:
         """The alignments with predictions of a rig with other facts."""
         model = self.estimation.model
         changed = replace(self.estimation, model=replace(model, rig=replace(model.rig, **of_rig)))
-        return changed.decided(changed._predictions(self.pairs, self.capture))
+        return changed.decided(changed._predictions(self.pairs, changed.decided(), self.capture))
 
 
 def without_nir(relief: UnderRelief) -> UnderRelief:

@@ -97,7 +97,8 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
         return resample_tile(band, *rest, **options)
 
     monkeypatch.setattr(full_resolution, "resample_tile", unreadable)
-    monkeypatch.setattr("agalign.capture.band_pair._LONGEST_SIDE_PX", 400)
+    for module in ("band_pair", "reference"):
+        monkeypatch.setattr(f"agalign.capture.{module}.LONGEST_SIDE_PX", 400)
     result = align_capture_bands(capture, Settings(joint=JointSettings(device="cpu")), None, lambda *_: None)
     assert {name: a.status for name, a in result.items()} == {"nir": "failed", "red": "aligned"}
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")

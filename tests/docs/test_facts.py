@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from agalign.batch.products import PRODUCTS
-from agalign.capture import band_pair, by_relief
+from agalign.capture import by_relief, reference
 from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
@@ -154,8 +154,8 @@ LIMITS = {
         f"the p95 of the windows' parallax is at least {by_relief.MIN_PARALLAX_PX:g} px",
         f"nodes every {displacement_field._LATTICE_PX} px",
         f"fitted to windows of {displacement_field._FIELD_WINDOW_PX} px",
-        f"Images above {band_pair._LONGEST_SIDE_PX} px",
-        f"fewer than {band_pair._COARSE_RATIO:g} pixels per reference pixel",
+        f"Images above {reference.LONGEST_SIDE_PX} px",
+        f"fewer than {reference.COARSE_RATIO:g} pixels per reference pixel",
     ),
     "explanation/verification.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
