@@ -82,7 +82,7 @@ class LearningCapture:
     @classmethod
     def of(cls, capture: Capture, estimation: CaptureEstimation) -> "LearningCapture":
         """Collect the results for the pairs of a capture."""
-        result, pairs = estimation.decided(), [band.pair for band in estimation.bands.values()]
+        result, pairs = estimation.decided(), estimation.pairs
         in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
         observation = observed(pairs, result, capture)

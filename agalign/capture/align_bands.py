@@ -149,7 +149,7 @@ class CaptureEstimation:
         if capture is None:
             return result
         result = self._refine_on_files(result, capture)
-        predictions = self._predictions(pairs, result, capture)
+        predictions = self._predictions(result, capture)
         return self.decided(predictions) if predictions else result
 
     def decided(self, predictions: Mapping[str, RigPrediction] | None = None) -> Alignments:
@@ -163,6 +163,11 @@ class CaptureEstimation:
             seed = find_seed(pair, self.settings.seed, self.model)
             is_asked_for = self.settings.seed.only and isinstance(seed, Seed)
             self.bands[pair.name] = BandCandidates(pair, seed, Issue(SEED_ASKED_FOR) if is_asked_for else None)
+
+    @property
+    def pairs(self) -> list[BandPair]:
+        """The pairs of all bands."""
+        return [band.pair for band in self.bands.values()]
 
     @property
     def seeds(self) -> dict[str, Seed]:
@@ -191,12 +196,11 @@ class CaptureEstimation:
 
     def _learn(self, result: Alignments, capture: Capture | None, *, scratch: bool) -> Alignments:
         """Align bands with networks that are learned from scratch; return the alignments then."""
-        seeds = self.seeds
         done = {b.pair.name for b in self.refined if not scratch or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
-        remaining = {name: seed for name, seed in seeds.items() if name not in done}
+        remaining = {name: seed for name, seed in self.seeds.items() if name not in done}
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
-            names = bands_to_learn([self.bands[name].pair for name in seeds], result, rig, capture)
+            names = bands_to_learn(self.pairs, result, rig, capture)
             remaining = {name: seed for name, seed in remaining.items() if name in names}
         if not remaining:
             return result
@@ -227,15 +231,15 @@ class CaptureEstimation:
         if not (extrapolated and self._may_be_homography):
             return result
         known = {b.pair.name: b.joint.fixed_to_moving for b in self.refined if b.joint.is_retrieved}
-        spreads_px = spreads_of_relief_px([band.pair for band in self.bands.values()], known)
+        spreads_px = spreads_of_relief_px(self.pairs, known)
         for band in extrapolated:
             band.candidates = [c.with_relief_std_px(spreads_px[band.pair.name]) for c in band.candidates]
         return self.decided()
 
-    def _predictions(self, pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> dict[str, RigPrediction]:
+    def _predictions(self, result: Alignments, capture: Capture) -> dict[str, RigPrediction]:
         """Return the predictions of the rig of the flight from the aligned bands of the capture."""
         rig = None if self.model is None else self.model.rig
-        return {} if rig is None else rig_predictions(pairs, result, rig, observed(pairs, result, capture))
+        return {} if rig is None else rig_predictions(self.pairs, result, rig, observed(self.pairs, result, capture))
 
     def _refine_on_files(self, result: Alignments, capture: Capture) -> Alignments:
         """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
@@ -257,7 +261,7 @@ class CaptureEstimation:
         report = partial(self.progress, next(iter(seeds)))  # with the name of the first band
         report("refining", 0.0)
         results: Results = {}
-        for group in image_groups([band.pair for band in self.bands.values()], seeds, sides):
+        for group in image_groups(self.pairs, seeds, sides):
             results |= align(group, report)
         return results
 

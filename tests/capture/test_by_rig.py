@@ -116,7 +116,7 @@ class Estimated:
         """The alignments with predictions of a rig with other facts."""
         model = self.estimation.model
         changed = replace(self.estimation, model=replace(model, rig=replace(model.rig, **of_rig)))
-        return changed.decided(changed._predictions(self.pairs, changed.decided(), self.capture))
+        return changed.decided(changed._predictions(changed.decided(), self.capture))
 
 
 def without_nir(relief: UnderRelief) -> UnderRelief:
