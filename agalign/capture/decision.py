@@ -46,7 +46,9 @@ def decide(
 
 
 def _of_several_reliefs(bands: Sequence[BandCandidates], reliefs: Sequence[UnderRelief]) -> UnderRelief:
-    """The relief of the capture, by its images alone: predictions by the rig have this relief. Empty without one."""
+    """Return the relief of the capture, chosen by its images alone, as predictions by the rig have it; empty without
+    one.
+    """
 
     def delivered(relief: UnderRelief) -> tuple[int, int]:
         alignments = _aligned(bands, relief, {}).values()

@@ -8,7 +8,8 @@ keypoints, patches and networks:
 
 * `paper` (`paper.descend`): SGD on theta and psi together, coarse to fine, one pair at a time, as published.
 * `fast` (`fast.learn`, then `refine.refine`): Adam on theta with in-batch negatives; every few steps, one
-  Gauss-Newton step on psi minimises L0 squared. At full resolution theta is frozen and only psi is optimised.
+  Gauss-Newton step on psi (`gauss_newton.solve`: a homography, affine mapping or translation) minimises L0 squared.
+  At full resolution theta is frozen and only psi is optimised.
 * `scratch`: the same from random weights.
 
 With the network of a flight, theta is frozen throughout (`refine_with`).

@@ -70,7 +70,7 @@ def issues_of(
     residual: Residual,
     joint: JointResult | None,
     common_px: Points,
-    pixel_px: float = 1.0,
+    pixel_px: float,
 ) -> tuple[Issue, ...]:
     """Return every reason for not accepting a mapping of a reference, without its pixels; empty if it passes.
 
@@ -124,7 +124,7 @@ def _window_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
         yield Issue(CLUSTER, cluster / count, limit / count)
 
 
-def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_]:
+def is_misaligned(residual: Residual, pixel_px: float) -> NDArray[np.bool_]:
     """Return True (n,) for windows with a shift that neither the limit nor its noise explain.
 
     `pixel_px` is the size of a pixel of the reference's file on this grid.
