@@ -16,12 +16,13 @@ from scipy.spatial import cKDTree
 from agalign.values import geometry
 from agalign.values.geometry import PairScales, Points
 from agalign.values.image import FloatImage, Tile
+from agalign.values.least_squares import shift_scale_px
 from agalign.values.lens_shapes import lens_shapes, shift_variance_px2, variance_px2
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
 from agalign.values.resampling import between_nodes, nodes_along
-from agalign.values.residual import Residual, noise_px, square_weights
+from agalign.values.residual import Residual, square_weights
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
@@ -202,7 +203,8 @@ class MappingError:
         damping = 1e-9 * np.trace(flat_corners.T @ flat_corners) * np.eye(8)
         followed = np.linalg.solve(flat_corners.T @ flat_corners + damping, flat_corners.T @ flat_lenses)
         remaining = flat_lenses - flat_corners @ followed
-        information = remaining.T @ remaining / shift_variance_px2(self._measured.std_px, with_shapes=True)
+        variance_px2 = shift_variance_px2(shift_scale_px(self._measured.lengths_px), with_shapes=True)
+        information = remaining.T @ remaining / variance_px2
         of_lenses = np.linalg.inv(np.diag(self.lens_std_px**-2.0) + information)
         result = np.zeros((12, 12))
         result[:8, :8] = self.covariance_px2[:8, :8] + followed @ of_lenses @ followed.T
@@ -221,7 +223,7 @@ class MappingError:
         measured = self._measured
         if measured is None:
             return np.zeros(len(points_px))
-        noise_px2, precision = np.square(noise_px(measured.peaks_sigma)), square_weights(measured)
+        noise_px2, precision = np.square(measured.noise_px), square_weights(measured)
         squares = np.square(measured.shifts_px).sum(axis=1)
         count = min(8, len(squares))  # nearest windows
         distance, index = (values.reshape(-1, count) for values in self._tree.query(points_px, k=count))
