@@ -267,5 +267,6 @@ def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     is_clear = sigma >= min_peak_sigma
     shifts_px[is_clear] = peak_positions(cross[is_clear], coarse[is_clear].astype(np.float64))
     noise_px[is_clear] = peak_noise_px(cross[is_clear], shifts_px[is_clear])
-    shifts_px[np.isinf(noise_px)] = np.nan
+    is_found = np.isfinite(noise_px)
+    shifts_px[~is_found] = noise_px[~is_found] = np.nan
     return shifts_px, noise_px
