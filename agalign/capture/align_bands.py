@@ -324,7 +324,8 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capt
         joint = alignment.joint
         # Fewer patches than a result needs: a network of its own may retrieve more.
         is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
-        has_common_structure = alignment.seed.trusted or is_above_chance
+        # A seed that replaced one that contradicts it has no score: the images do not confirm it.
+        has_common_structure = (alignment.seed.trusted and alignment.seed.score > 0) or is_above_chance
         return not has_common_structure or predictions[pair.name].of_scene.std_px <= DELIVERED_STD_PX
 
     return {pair.name for pair in pairs if not is_skipped(pair)}

@@ -93,7 +93,8 @@ class DisplacementEstimator:
                 break
         assert field is not None
         before, after = self._held_out(moving, mapping, field, total)
-        is_used = _is_one_to_one(field, self.size_px) and after.p95_px <= _MAX_P95_GROWTH * before.p95_px
+        is_verified = after.is_measured.any() and after.p95_px <= _MAX_P95_GROWTH * before.p95_px
+        is_used = is_verified and _is_one_to_one(field, self.size_px)
         return DisplacementResult(field if is_used else None, before.p95_px, after.p95_px, after)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:

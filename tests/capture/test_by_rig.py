@@ -222,6 +222,11 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
     for parallax_px, names in ({}, set()), ({"NIR": 10.0}, {"NIR"}):
         rig = replace(model.rig, parallax_px=parallax_px)
         assert bands_to_learn(first.pairs, lost, rig, first.capture) == names
+    # The seed of the tags replaced a chance peak, as over water: nothing in the images can be learned.
+    replaced = first.with_nir(issue=Issue(RETRIEVAL, 0.0, 0.2), seed=replace(seed, score=0.0)).estimation.decided()
+    rig = replace(model.rig, parallax_px={"NIR": 10.0})
+    of_chance = replace(replaced["NIR"], joint=None)
+    assert bands_to_learn(first.pairs, {**replaced, "NIR": of_chance}, rig, first.capture) == set()
 
 
 @pytest.mark.full

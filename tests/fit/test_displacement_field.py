@@ -99,6 +99,18 @@ def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.Mo
     assert {smoothness / count for count, smoothness in fits} <= {1.0, 4.0, 16.0, 64.0}
 
 
+def test_a_field_without_held_out_windows_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A single textured patch has windows to fit, and none at a distance from them."""
+
+    def nowhere(*arguments: object) -> np.ndarray:
+        return np.full((len(arguments[2].centres_px), 2), np.nan)
+
+    monkeypatch.setattr(DisplacementEstimator, "_cross_predicted", nowhere)
+    image = texture(*SIZE)
+    result = DisplacementEstimator(image.valid, structure_field(image)).refine(image, PixelMapping(np.eye(3)))
+    assert (result.field, result.after_p95_px) == (None, np.inf)
+
+
 def test_a_field_that_clearly_increases_p95_is_rejected() -> None:
     for after_p95_px, is_significant in ((1.62, True), (1.69, False)):
         gain = _Gain(1.0, before_p95_px=1.59, after_p95_px=after_p95_px, loss=0.1, sigma=9.0)
