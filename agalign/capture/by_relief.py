@@ -413,7 +413,9 @@ class _Estimate:
 
 
 def _with_field(candidate: Candidate) -> Candidate:
-    """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it."""
+    """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it: those of the
+    field have to pass the checks too, unless the candidate does not pass without it.
+    """
     pair, mapping = candidate.pair, candidate.mapping
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
     if displacement is None or displacement.field is None:
@@ -422,7 +424,9 @@ def _with_field(candidate: Candidate) -> Candidate:
     with_field = replace(mapping, field=displacement.field)
     error = mapping_error(pair, with_field, candidate.error.covariance_px2, candidate.residual, mapping.field)
     p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.after_p95_px}
-    return replace(candidate, mapping=with_field, error=error, held_out_p95_px=p95_px)
+    of_field = displacement.held_out
+    result = replace(candidate, mapping=with_field, error=error, other_residual=of_field, held_out_p95_px=p95_px)
+    return candidate if result.issues and not candidate.issues else result
 
 
 def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:

@@ -106,14 +106,19 @@ class Residual:
         """
         if not len(self.lengths_px):
             return math.inf
-        noise_px, weights = self.noise_px[self.is_measured], square_weights(self)
-
-        def quantile(values: NDArray[np.float64], p: float) -> float:
-            return float(np.quantile(values, p, weights=weights, method="inverted_cdf"))
-
         # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
-        rms_px = max(quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
-        return math.sqrt(max(rms_px**2 - quantile(noise_px, 0.5) ** 2, (rms_px / 2) ** 2))
+        rms_px = max(self._quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
+        return math.sqrt(max(rms_px**2 - self.median_noise_px**2, (rms_px / 2) ** 2))
+
+    @property
+    def median_noise_px(self) -> float:
+        """Median RMS noise of the lengths of the measured shifts, px of the reference, weighted as in `std_px`; 0
+        without any.
+        """
+        return self._quantile(self.noise_px[self.is_measured], 0.5) if len(self.lengths_px) else 0.0
+
+    def _quantile(self, values: NDArray[np.float64], p: float) -> float:
+        return float(np.quantile(values, p, weights=square_weights(self), method="inverted_cdf"))
 
     @property
     def is_even_cell(self) -> NDArray[np.bool_]:
