@@ -23,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from common import print_head, print_row, run
 
-from agalign.batch.capture_task import lost_reflectance, missing_radiometry
+from agalign.batch.capture_task import missing_radiometry
+from agalign.batch.render import lost_reflectance
 from agalign.cameras.discover import discover
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Directory, Entry, add_directories, read_directories, text
 from agalign.pixels.radiometry import calibrated, with_checked_pixels, with_radiometry
@@ -203,7 +204,7 @@ def outcome(folder: Path) -> Outcome:
     light = LightOverCaptures()
     for capture in scan.captures:
         one = with_radiometry(capture, "auto", {})
-        said |= {without_numbers(t) for t in (missing_radiometry(one, "auto"), *lost_reflectance(one, "auto")) if t}
+        said |= {without_numbers(t) for t in (missing_radiometry(one, "auto"), lost_reflectance(one, "auto")) if t}
         try:
             one = replace(one, bands=tuple(with_checked_pixels(band, read_tile) for band in one.bands))
         except Exception as error:  # a refusal of the capture

@@ -117,8 +117,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         sidecar, alignments = estimate(capture, out, settings, model, progress, earlier, read)
     progress(capture.reference.name, "writing", 0.0)
     report = render(capture, out, settings, sidecar, alignments, task.rendering, read)
-    failed = (*report.failed_products, *lost_reflectance(capture, settings.write.radiometry))
-    return replace(report, failed_products=failed, seconds=time.perf_counter() - began_s)
+    return replace(report, seconds=time.perf_counter() - began_s)
 
 
 def estimate(
@@ -196,12 +195,6 @@ def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
         "--radiometry sun or camera",
     }
     return missing.get(choice, f"no tags for radiance in {bands}; leave --radiometry out")
-
-
-def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> tuple[str, ...]:
-    """Return the implausible tag that makes `auto` write radiance instead of reflectance; empty if there is none."""
-    lost = (b for b in capture.bands if b.implausible and b.radiometry is not None and b.radiometry.is_of_light)
-    return tuple(f"not written as reflectance: {b.name}: {b.implausible}" for b in lost if choice == "auto")[:1]
 
 
 @one_thread()

@@ -40,6 +40,7 @@ from agalign.records.sidecar_file import file_part, write_sidecar
 from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
+from agalign.values.choices import RadiometryChoice
 from agalign.values.image import OutputGrid
 from agalign.values.radiometric_errors import saturation_error
 from agalign.values.radiometry import Radiometry, total_percent
@@ -219,7 +220,14 @@ def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPa
         undistorted=grid.undistorted,
         vignetting_corrected=any(file.is_flat for file in context.written),
         nodata=values.pop() if len(values) == 1 else None,
+        without_reflectance=lost_reflectance(capture, context.settings.write.radiometry),
     )
+
+
+def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> str | None:
+    """Return the implausible tag that makes `auto` write radiance instead of reflectance; None if there is none."""
+    lost = (b for b in capture.bands if b.implausible and b.radiometry is not None and b.radiometry.is_of_light)
+    return next((f"{b.name}: {b.implausible}" for b in lost), None) if choice == "auto" else None
 
 
 def _band_radiometry(band: str, radiometry: Radiometry, saturated: float) -> BandRadiometryPart:

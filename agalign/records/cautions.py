@@ -41,6 +41,11 @@ noise are wrong at edges, those of water and fog are not."""
 
 _MAX_REFLECTANCE_ERROR = 1.0
 """Of a usable reflectance: a factor of 2 changes every index."""
+_WITHOUT_REFLECTANCE = Remedy(
+    "radiance, not reflectance: the tags of the light sensor cannot be used",
+    "compare the tags with those of the other captures, and correct them; --radiometry panel uses calibration panels, "
+    "--radiometry camera writes radiance of all captures",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +68,7 @@ class Caution:
     status: str = "check"
     """That of the band; `check` for an accepted one, and for a missing one `missing`."""
     is_unusable: bool = False
-    """The values are too uncertain for any use: the run returns exit code 3."""
+    """The values are too uncertain for any use, or radiance instead of reflectance: the run returns exit code 3."""
     capture: str = ""
     """Label of the capture."""
 
@@ -126,6 +131,9 @@ class RunFacts:
             return
         for band_part in output.band_radiometry:
             yield from _of_factors(band_part)
+            if output.without_reflectance:
+                reason = f"not written as reflectance: {output.without_reflectance}"
+                yield Caution(band_part.band, _WITHOUT_REFLECTANCE, reason, 1.0, is_unusable=True)
         if output.light_from is None:
             return
         scales = self._sensor_scales(sidecar.captured_at)

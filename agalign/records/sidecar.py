@@ -91,7 +91,7 @@ class ReferencePart(_Part):
     band: Name
     """Name."""
     file: SourceFile
-    """Image file, relative to the input folder that the run record names; absolute if it is elsewhere."""
+    """Image file; absolute if it is outside the input folder."""
     band_index: Count
     """Band of the file, from 1."""
     width: Count
@@ -282,7 +282,7 @@ class BandResult(_Part):
     wavelength_nm: Number | None
     """Centre wavelength, nm."""
     file: SourceFile
-    """Image file, relative to the input folder that the run record names; absolute if it is elsewhere."""
+    """Image file; absolute if it is outside the input folder."""
     band_index: int
     """Band of the file, from 1."""
     size_px: tuple[Count, Count] | None = None
@@ -438,8 +438,7 @@ class BandRadiometryPart(_Part):
     errors: list[RadiometricError]
     """What its values depend on, with the error by each."""
     cell_means: Annotated[NDArray[np.float64], Array((12, 16), nullable=True)] | None = None
-    """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row: over many captures the
-    mean is flat, and captures of the same ground agree. Null for a dark image."""
+    """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row; null for a dark image."""
 
 
 class OutputPart(_Part):
@@ -467,6 +466,8 @@ class OutputPart(_Part):
     """True if vignetting is corrected in the files of single bands."""
     nodata: float | Name | None
     """Nodata value (`"nan"` for NaN); null if it differs between single bands."""
+    without_reflectance: Message | None = None
+    """Implausible tag that made `--radiometry auto` write radiance."""
 
     @property
     def light_from(self) -> str | None:

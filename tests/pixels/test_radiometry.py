@@ -16,12 +16,16 @@ from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.radiometry import calibrated, plausible, with_checked_pixels, with_radiometry
 from agalign.pixels.raster import probe, read_tile
+from agalign.records.run_record import read_run_record
+from agalign.records.sidecar_file import read_sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 from ..builders import in_full_run
 from ..conftest import seeded
+from ..program import agalign_here
+from ..run_outputs import table_in
 
 
 def test_every_term_of_the_calibration_is_applied() -> None:
@@ -182,33 +186,56 @@ def test_pixels_that_do_not_fit_the_calibration_are_refused(tmp_path: Path) -> N
         check(30000, 4800.0, 8.0)
 
 
-@pytest.mark.parametrize(
-    ("irradiance", "choice", "states", "text"),
-    [
-        (b"0.001", "sun", ["done", "error"], r"light sensor in NIR \(the irradiance .* of 1e-05 is not within 0"),
-        (b"0.001", "auto", ["done", "done"], "not written as reflectance: NIR: the irradiance .* of 1e-05"),
-        in_full_run(
-            b"-80", "auto", ["done", "done"], "not written as reflectance: NIR: HorizontalIrradiance is negative"
-        ),
-        in_full_run(
-            b"1e-320", "auto", ["done", "done"], "not written as reflectance: NIR: the irradiance .* of 9.88131e-323 is"
-        ),
-        (b"0.6", "auto", ["done", "error"], "IMG_0002_4.tif: its median reflectance of .* is above 2"),
-    ],
-)
-def test_a_capture_with_an_implausible_tag_is_not_written_as_reflectance(
-    flight: Path, tmp_path: Path, irradiance: bytes, choice: RadiometryChoice, states: list[str], text: str
-) -> None:
-    """A band of the second capture has this irradiance in its tags."""
-    folder = shutil.copytree(flight, tmp_path / "in")
+def with_irradiance(flight: Path, folder: Path, irradiance: bytes) -> Path:
+    """Copy a flight into a folder, and replace the irradiance in the tags of a band of the second capture."""
+    shutil.copytree(flight, folder)
     path = folder / "0000SET" / "000" / "IMG_0002_4.tif"
     tags = read_directories(path)
     packet = re.sub(rb"(?<=<DLS:HorizontalIrradiance>)[^<]+", irradiance, tags[0][XMP].data)
     add_directories(path, {XMP: byte_string(packet)}, tags[EXIF], tags[GPS])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("irradiance", "choice", "text"),
+    [
+        (b"0.001", "sun", r"light sensor in NIR \(the irradiance .* of 1e-05 is not within 0"),
+        (b"0.6", "auto", "IMG_0002_4.tif: its median reflectance of .* is above 2"),
+    ],
+)
+def test_a_capture_with_an_implausible_tag_is_not_written(
+    flight: Path, tmp_path: Path, irradiance: bytes, choice: RadiometryChoice, text: str
+) -> None:
+    folder = with_irradiance(flight, tmp_path / "in", irradiance)
     reports = agalign.align_folder(folder, tmp_path / "out", settings=seeded(radiometry=choice))
-    assert [r.state for r in reports] == states
+    assert [r.state for r in reports] == ["done", "error"]
     assert reports[0].problems == ()
     (problem,) = reports[1].problems
     assert re.search(text, problem)
-    written = [r.result.output.radiometry for r in reports if r.result]
-    assert written == ["reflectance by light sensor", "radiance by camera calibration"][: len(written)]
+
+
+@pytest.mark.parametrize(
+    ("irradiance", "text"),
+    [
+        (b"0.001", "NIR: the irradiance .* of 1e-05"),
+        in_full_run(b"-80", "NIR: HorizontalIrradiance is negative"),
+        in_full_run(b"1e-320", "NIR: the irradiance .* of 9.88131e-323 is"),
+    ],
+)
+def test_radiance_instead_of_reflectance_is_the_same_caution_in_every_command(
+    flight: Path, tmp_path: Path, irradiance: bytes, text: str
+) -> None:
+    folder, out = with_irradiance(flight, tmp_path / "in", irradiance), tmp_path / "out"
+    cause = "radiance, not reflectance: the tags of the light sensor cannot be used"
+    run = folder, "-o", out, "--seed", "rig", "--only-seed", "--radiometry", "auto"
+    for command in (run, run, ("report", out), ("verify", out)):
+        done = agalign_here(*command)
+        assert done.returncode == (3 if command is run else 0), done.stderr
+        assert (cause in done.stderr) == (command[0] != "verify")
+        assert "resumes" not in done.stderr
+        assert read_run_record(out).problems == []
+        checks = {(row["capture"], row["band"]): row["check"] for row in table_in(out / "summary.csv")}
+        assert all(bool(re.search(text, check)) == (key[0] == "IMG_0002") for key, check in checks.items())
+    sidecars = [read_sidecar(out / "0000SET" / "000" / f"IMG_000{number}.json") for number in (1, 2)]
+    written = [sidecar.output.radiometry for sidecar in sidecars]
+    assert written == ["reflectance by light sensor", "radiance by camera calibration"]

@@ -294,3 +294,12 @@ def test_what_values_are_not_corrected_for_is_a_caution(state: str, cause: str) 
     found = cautions(output=calibrated_output(vignetting=(12.0, state)))
     assert [cause in c.remedy.cause for c in found] == ([True] if cause else [])
     assert [round(c.lost, 2) for c in found] == ([0.12] if cause else [])
+
+
+def test_radiance_instead_of_reflectance_is_unusable_in_every_band() -> None:
+    band = {"band": "Red", "std_percent": 20.0, "errors": []}
+    output = calibrated_output()
+    output |= {"without_reflectance": "NIR: is negative", "band_radiometry": [*output["band_radiometry"], band]}
+    found = cautions(output=output | {"radiometry": "radiance by camera calibration"})
+    assert [(c.band, c.lost, c.is_unusable) for c in found] == [("NIR", 1.0, True), ("Red", 1.0, True)]
+    assert {c.reason for c in found} == {"not written as reflectance: NIR: is negative"}
