@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from agalign.host.text import counted
+from agalign.records.run_record import ProblemKind
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar
 
@@ -34,8 +35,9 @@ class CaptureReport:
     label: str
     """Folder and number of the capture, as 0000SET/000/IMG_0001."""
     state: Literal["done", "kept", "error", "panel", "sky"]
-    """`done`: processed in this run. `kept`: an earlier run with the same settings has finished the capture. `error`:
-    there is no result. `panel`, `sky`: the capture shows a calibration panel or the sky, and is not aligned.
+    """`done`: processed in this run. `kept`: the result of an earlier run, with the same settings unless there is a
+    `why_kept`. `error`: there is no result. `panel`, `sky`: the capture shows a calibration panel or the sky, and is
+    not aligned.
     """
     result: Sidecar | None = field(default=None, repr=False)
     """Content of the sidecar without its long tables; None for a capture with an `error`."""
@@ -49,6 +51,8 @@ class CaptureReport:
     """Why the capture counts as sky."""
     failed_products: tuple[str, ...] = ()
     """Products that could not be written, and why."""
+    why_kept: str = ""
+    """Which input files of an earlier result are lost, so that this run does not replace it; empty if none are."""
     removed: tuple[tuple[Path, str], ...] = ()
     """Files of an earlier command that were removed, and why."""
     seconds: float = 0.0
@@ -66,13 +70,20 @@ class CaptureReport:
         """True if every band pair is aligned or predicted accurately enough, none is missing, and all products are
         written; also for panels and the sky.
         """
-        done = self.result is not None and self.result.status == "ok" and not self.failed_products
+        done = self.result is not None and self.result.status == "ok" and not self.problems
         return self.state in ("panel", "sky") or done
 
     @property
     def problems(self) -> tuple[str, ...]:
         """Errors, except bands that are not aligned; those are in the sidecar."""
-        return self.failed_products if self.error is None else (self.error, *self.failed_products)
+        return tuple(self.kinds_of_problems)
+
+    @property
+    def kinds_of_problems(self) -> dict[str, ProblemKind]:
+        """The kind of each problem in the record of the run, by its text."""
+        kinds = dict[str, ProblemKind]({} if self.error is None else {self.error: "failed"})
+        kinds |= dict.fromkeys(self.failed_products, "not_written")
+        return kinds | ({self.why_kept: "kept"} if self.why_kept else {})
 
     @property
     def summary(self) -> str:

@@ -120,8 +120,8 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
         try:
             for report in run.reports(selection, record):
                 finished[report.label] = Finished(report.state, seconds=report.seconds)
-                for text in report.problems:
-                    record.add_problem(report.label, text)
+                for text, kind in report.kinds_of_problems.items():
+                    record.add_problem(report.label, text, kind)
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
@@ -143,7 +143,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                 if one.sidecar is not None and not earlier_results.outputs_exist(one.sidecar, one.files):
                     gone.append(label)
                     finished[label] = Finished("error")
-                    record.add_problem(label, f"its files were removed during the run; {again}")
+                    record.add_problem(label, f"its files were removed during the run; {again}", "failed")
             record.count(finished)
         if gone:
             what = f"outputs of {counted(len(gone), 'capture')} were removed during the run, such as of {gone[0]}"
@@ -180,8 +180,9 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     record.file_states = {} if earlier is None else dict(earlier.file_states)
     record.other_inputs = earlier_results.labels_of_other_inputs(earlier, record)
     record.not_in_input = list(earlier_results.results_not_in_input(run.flight, run.out, record.other_inputs))
+    used = {band.path for capture in run.flight.captures for band in capture.bands}
     for problem in run.flight.problems:
-        record.add_problem(str(problem.path), problem.text)
+        record.add_problem(str(problem.path), problem.text, "used" if problem.path in used else "skipped")
     record.write(run.out, "running", 0.0)
     try:
         yield record
@@ -408,13 +409,12 @@ class _FlightRun:
     def _kept(self, capture: Capture, left: Remaining) -> CaptureReport:
         """Return the report of a capture that this run does not process."""
         path = CapturePaths.of(capture, self.out).sidecar
-        problems = (left.why_kept,) if left.why_kept else ()
         with suppress(SidecarError):
             sidecar, change = self.results(path)
             if not change:
-                return CaptureReport(capture.label, "kept", sidecar, path, failed_products=problems)
+                return CaptureReport(capture.label, "kept", sidecar, path, why_kept=left.why_kept)
         why = left.why_kept or f"{path}: was changed during the run; the same command estimates the capture again"
-        return CaptureReport(capture.label, "error", error=why)
+        return CaptureReport(capture.label, "error", error=why, why_kept=left.why_kept)
 
     def _earlier_grid(self, left: Remaining) -> OutputGrid | None:
         """Return the grid of the rasters of an earlier result if this run makes the same; None without any."""

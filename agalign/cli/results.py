@@ -72,7 +72,7 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
     if unfinished is None or not unfinished.sentence:
         return False
     facts = {"state": unfinished.state, "missing": unfinished.missing, "erroneous": unfinished.erroneous}
-    terminal.problem(f"{out}: {unfinished.sentence}", **facts)
+    terminal.problem(f"{out}: {unfinished.sentence}", **facts, kept=unfinished.kept)
     return True
 
 

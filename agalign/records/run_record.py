@@ -29,6 +29,19 @@ _SCHEMA = "agalign-run/2"
 _MAX_NAMED = 10
 """Captures that a sentence names."""
 RunState = Literal["running", "interrupted", "finished"]
+ProblemKind = Literal["", "skipped", "used", "failed", "kept", "not_written"]
+"""Of a file: `skipped`, or `used` in spite of the problem. Of a capture: `failed`; `kept` as an earlier run left it,
+because input files are lost; an output was `not_written`. Empty in records of earlier versions.
+"""
+_IN_WORDS: Mapping[ProblemKind, tuple[str, str]] = {
+    "skipped": ("file or capture took no part", "files or captures took no part"),
+    "used": ("file was used in spite of a problem", "files were used in spite of a problem"),
+    "failed": ("capture could not be processed", "captures could not be processed"),
+    "kept": ("capture was kept as it was", "captures were kept as they were"),
+    "not_written": ("output was not written", "outputs were not written"),
+    "": ("problem", "problems"),
+}
+"""What one problem of a kind is called, and several."""
 
 
 class _Part(BaseModel):
@@ -46,10 +59,12 @@ class RefusalPart(_Part):
 
 
 class ProblemPart(_Part):
-    """A file that was left out or a capture that failed, and the reason."""
+    """A problem of a file or of a capture."""
 
     of: str
+    """Path of the file, or label of the capture."""
     problem: str
+    kind: ProblemKind = ""
 
 
 @dataclass(frozen=True)
@@ -123,9 +138,15 @@ class RunPart(_Part):
             if status != "aligned"
         ]
 
-    def add_problem(self, what: str, text: str) -> None:
+    def add_problem(self, what: str, text: str, kind: ProblemKind) -> None:
         """Add a problem of a file or capture; characters that are not printable are escaped."""
-        self.problems.append(ProblemPart(of=escape_controls(what), problem=escape_controls(text)))
+        self.problems.append(ProblemPart(of=escape_controls(what), problem=escape_controls(text), kind=kind))
+
+    @property
+    def problems_in_words(self) -> str:
+        """The number of problems of each kind, in words."""
+        counts = Counter(part.kind for part in self.problems)
+        return ", ".join(f"{n} {words[n > 1]}" for kind, words in _IN_WORDS.items() if (n := counts[kind]))
 
     def notes_on_input(self) -> list[str]:
         """Return a line about the results of captures that the input no longer has, and one about renamed captures."""
@@ -247,6 +268,8 @@ class UnfinishedRun:
     """Labels of those without a result."""
     erroneous: list[str]
     """Labels of those with a result and an error: some or all of their files are of an earlier run."""
+    kept: list[str]
+    """Labels of those that cannot be processed, as input files are lost."""
 
     @property
     def sentence(self) -> str:
@@ -262,7 +285,13 @@ class UnfinishedRun:
         if self.erroneous:
             what = f"errors in {len(self.erroneous)} {of_all}, whose files may be of an earlier run"
             parts.append(f"{what}: {some_of(self.erroneous, _MAX_NAMED)}")
-        return "; ".join([*parts, "the same command resumes it"]) if parts else ""
+        parts += ["the same command resumes it"] if parts else []
+        if self.kept:
+            verb = "was" if len(self.kept) == 1 else "were"
+            what = f"{len(self.kept)} {of_all} {verb} not processed, as input files are missing or damaged"
+            remedy = "copy them from the card again, or align without them by --overwrite"
+            parts.append(f"{what}: {some_of(self.kept, _MAX_NAMED)}; {remedy}")
+        return "; ".join(parts)
 
 
 def unfinished_run(
@@ -275,7 +304,10 @@ def unfinished_run(
         return None
     excluded = {part.label for part in not_aligned if part.is_left_out}
     wanted = [label for label in record.labels if label not in excluded]
-    with_problem = {part.of for part in record.problems}
+    kept = {part.of for part in record.problems if part.kind == "kept"}
+    with_error = {part.of for part in record.problems} - kept
     missing = [label for label in wanted if label not in labels]
-    erroneous = [label for label in wanted if label in labels and escape_controls(label) in with_problem]
-    return UnfinishedRun(record.state, len(wanted), missing, erroneous)
+    erroneous = [label for label in wanted if label in labels and escape_controls(label) in with_error]
+    return UnfinishedRun(
+        record.state, len(wanted), missing, erroneous, [label for label in wanted if escape_controls(label) in kept]
+    )

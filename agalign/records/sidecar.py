@@ -290,7 +290,7 @@ class BandResult(_Part):
     status: PairStatus
     """`reference`, `aligned`, `predicted`, `seed_only` or `failed`."""
     reason: Message | None
-    """Why the band is not aligned, in words."""
+    """Why the band is not aligned."""
     issues: tuple[Issue, ...] = ()
     """All reasons; `reason` is the first."""
     homography: HomographyPart | None = None
@@ -317,7 +317,7 @@ class BandResult(_Part):
     exposed_after_s: Number3 | None = None
     """Delay of the exposure relative to the reference, s; null if the band is aligned."""
     error: ErrorPart | None = None
-    """What the expected error of the mapping is made of; null if it is unknown."""
+    """Parts of the expected error; null if it is unknown."""
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
     saturated: Number4 | None = None

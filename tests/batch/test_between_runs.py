@@ -12,7 +12,9 @@ import pytest
 import agalign
 from agalign.batch import capture_task
 from agalign.batch.output_files import is_own
+from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories
 from agalign.records import sidecar_file
+from agalign.records.run_record import read_run_record
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
 
@@ -100,8 +102,21 @@ def test_a_result_with_more_bands_is_kept(copy: Path, out: Path, harmed: Path, h
         assert "--overwrite" in lines[0]
         assert {k: v for k, v in captures_in(out, "IMG_0001*").items() if before.get(k) != v} == {}
         assert read_json(out / "agalign-run.json")["captures"]["kept"] >= 1
+    done = agalign_here("report", out)
+    assert done.returncode == 3
+    assert "1 of 2 captures was not processed, as input files are missing or damaged: " in done.stderr
+    assert "resumes" not in done.stderr
     agalign_here(copy, "-o", out, *COMMAND, "--overwrite")
     assert captures_in(out)["IMG_0001.json"] != before["IMG_0001.json"]
+
+
+def test_a_problem_of_a_file_says_whether_the_file_is_used(copy: Path, out: Path) -> None:
+    tags = read_directories(copy / NIR)
+    add_directories(copy / NIR, {XMP: byte_string(tags[0][XMP].data[:-200])}, tags[EXIF], tags[GPS])
+    (copy / FOLDER / "IMG_0009_1.tif").write_bytes(b"")
+    agalign.align_folder(copy, out, settings=SEEDS)
+    kinds = {Path(part.of).name: part.kind for part in read_run_record(out).problems}
+    assert kinds == {NIR.name: "used", "IMG_0009_1.tif": "skipped"}
 
 
 def test_a_file_that_comes_back_needs_no_option(copy: Path, out: Path) -> None:

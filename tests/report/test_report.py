@@ -99,11 +99,19 @@ def headline(out: Path) -> str:
 def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert headline(out).startswith("Every band of every capture is aligned. Expected error: 0.")
     record, sidecar = out / "agalign-run.json", out / "0000SET" / "000" / "IMG_0002.json"
-    change(record, problems=[{"of": "IMG_0003_1.tif", "problem": "cannot be read"}])
+    damaged = {"of": "IMG_0001_1.tif", "problem": "its XMP packet is damaged", "kind": "used"}
+    change(record, problems=[damaged])
+    assert headline(out).startswith("Every band of every capture is aligned. Expected error: 0.")
+    assert headline(out).endswith(" 1 file was used in spite of a problem.")
+    change(record, problems=[{"of": "IMG_0003_1.tif", "problem": "cannot be read", "kind": "skipped"}])
     assert headline(out).startswith("8 of 8 band pairs are aligned. Expected error: ")
     assert headline(out).endswith(" 1 file or capture took no part.")
-    change(record, problems=[{"of": "0000SET/000/IMG_0002", "problem": "IMG_0002.png: cannot be written"}])
-    assert " 1 output was not written. Errors in 1 of 2 captures" in headline(out)
+    unwritten = {"of": "0000SET/000/IMG_0002", "problem": "IMG_0002.png: cannot be written"}
+    change(record, problems=[damaged, unwritten | {"kind": "not_written"}])
+    said = " 1 file was used in spite of a problem, 1 output was not written. Errors in 1 of 2 captures"
+    assert said in headline(out)
+    change(record, problems=[unwritten])  # of an earlier version
+    assert " 1 problem. Errors in 1 of 2 captures" in headline(out)
     labels = [f"0000SET/000/IMG_000{number}" for number in (1, 2, 3, 4)]
     change(record, problems=[], state="interrupted", labels=labels)
     assert headline(out).startswith("8 of 8 band pairs are aligned.")
