@@ -225,7 +225,7 @@ def test_a_capture_that_is_ok_by_prediction_is_not_shown_as_ok(out: Path) -> Non
 
 
 @pytest.mark.slow
-def test_indices_that_were_not_written_are_named_with_the_reason(out: Path) -> None:
+def test_indices_that_were_not_written_are_named_with_the_reason(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sidecar = out / "0000SET" / "000" / "IMG_0002.json"
     contents = read_json(sidecar)
     options = {"options": {"write": {"indices": ["ndvi"]}}}
@@ -241,6 +241,12 @@ def test_indices_that_were_not_written_are_named_with_the_reason(out: Path) -> N
     assert "<b>NDVI of 1 capture</b>" in page
     assert f"<td>{reason}</td>" in page
     assert (out / "indices.csv").is_file() == table, "the table is not changed"
+    monkeypatch.setattr("agalign.report.pages._MAX_LISTED", 0)
+    text = "".join(write_pages(out, pytest.fail).json_lines())
+    assert [c["unwritten"] for c in json.loads(text)["captures"]] == [[], [["ndvi", reason]]]
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert "<p>The first 0 of 1; <code>agalign report --json</code> prints all.</p>" in page
+    assert 'href="indices.csv"' not in page
     # The bands can be used; the raster was deleted, or its disk was full.
     change(sidecar, bands=contents["bands"], status="ok", **options)
     write_pages(out, pytest.fail)
