@@ -225,13 +225,14 @@ def output_of(capture: Capture) -> OutputPart:
     """The part of a sidecar about the reflectance of a capture."""
     converted = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None}
     parts = [
-        BandRadiometryPart(band=name, std_percent=0, errors=[], cell_means=np.array(r.cell_means))
+        BandRadiometryPart(
+            band=name, quantity=r.quantity, source=r.source, std_percent=0, errors=[], cell_means=np.array(r.cell_means)
+        )
         for name, r in converted.items()
         if r.cell_means
     ]
-    quantity = next((r.quantity for r in converted.values()), None)
     crop = (0, 0, *capture.reference.size_px)
-    return OutputPart(file=None, radiometry=quantity, band_radiometry=parts, crop=crop, nodata=None)
+    return OutputPart(file=None, band_radiometry=parts, crop=crop, nodata=None)
 
 
 def sample(band: Band) -> np.ndarray:

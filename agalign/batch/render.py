@@ -4,6 +4,7 @@ A product that an earlier command wrote is written again with the settings of th
 One that cannot be written any more is removed, and the report of the capture names it.
 """
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -199,22 +200,18 @@ def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPa
     values = {f.nodata_in_json for f in stack or [f for f in context.written if f.kind == BandFiles.kind]}
     grid, capture = context.grid, context.capture
     radiometry = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None and not context.is_raw}
-    names = dict.fromkeys(f"{r.quantity} by {r.source}" for r in radiometry.values())
+    bands = [_band_radiometry(name, r, saturated.get(name, 0.0)) for name, r in radiometry.items()]
     return OutputPart(
         file=context.paths.relative(stack[0].path) if stack else None,
         bands=[layer.band.name for layer in context.layers],
-        radiometry=" and ".join(names) or None,
+        radiometry=" and ".join(dict.fromkeys(f"{part.quantity} by {part.source}" for part in bands)) or None,
         panel_age_s=next((r.panel_age_s for r in radiometry.values() if r.panel_age_s is not None), None),
         illumination=[
             IlluminationPart(band=name, irradiance=r.irradiance, reflectance_per_radiance=r.factor)
             for name, r in radiometry.items()
             if "reflectance" in r.quantity
         ],
-        band_radiometry=[
-            _band_radiometry(name, r, saturated.get(name, 0.0))
-            for name, r in radiometry.items()
-            if r.quantity != "temperature"
-        ],
+        band_radiometry=bands,
         crop=(grid.x0, grid.y0, grid.width, grid.height),
         scale=(grid.scale.x, grid.scale.y),
         undistorted=grid.undistorted,
@@ -232,6 +229,9 @@ def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> str | None:
 
 def _band_radiometry(band: str, radiometry: Radiometry, saturated: float) -> BandRadiometryPart:
     """The part about the values of a band, given the share of its pixels that are saturated."""
+    facts: dict[str, Any] = {"band": band, "quantity": radiometry.quantity, "source": radiometry.source}
+    if radiometry.quantity == "temperature":
+        return BandRadiometryPart(**facts, std_percent=math.nan, errors=[])
     errors = [*radiometry.errors, *([saturation_error(saturated)] if saturated else [])]
     means = np.array(radiometry.cell_means) if radiometry.cell_means else None
-    return BandRadiometryPart(band=band, std_percent=total_percent(errors), errors=errors, cell_means=means)
+    return BandRadiometryPart(**facts, std_percent=total_percent(errors), errors=errors, cell_means=means)

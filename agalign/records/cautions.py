@@ -131,31 +131,27 @@ class RunFacts:
             return
         for band_part in output.band_radiometry:
             yield from _of_factors(band_part)
-            if output.without_reflectance:
+            if output.without_reflectance and band_part.quantity != "temperature":
                 reason = f"not written as reflectance: {output.without_reflectance}"
                 yield Caution(band_part.band, _WITHOUT_REFLECTANCE, reason, 1.0, is_unusable=True)
-        if output.light_from is None:
-            return
         scales = self._sensor_scales(sidecar.captured_at)
         age_s = output.panel_age_s or 0.0
         choice = (sidecar.options or {}).get("write", {}).get("radiometry", "auto")
         remedy = remedies.CONTRADICTING_LIGHT.get(choice, remedies.CONTRADICTING_LIGHT["auto"])
-        is_by_panel, is_by_sensor = (name in output.light_from for name in ("panel", "light sensor"))
-        is_old = age_s > _MAX_PANEL_AGE_S and not is_by_sensor
-        for band in sidecar.bands:
-            if is_by_panel and output.panel_age_s is None:
-                yield Caution(band.band, remedies.PANEL_WITHOUT_TIME, remedies.PANEL_WITHOUT_TIME.cause, 0.0)
-            if band.band in scales:
-                scale = scales[band.band]
+        for band, source in output.light_sources.items():
+            is_by_sensor = "light sensor" in source
+            if "panel" in source and output.panel_age_s is None:
+                yield Caution(band, remedies.PANEL_WITHOUT_TIME, remedies.PANEL_WITHOUT_TIME.cause, 0.0)
+            if (scale := scales.get(band)) is not None:
                 error = max(scale, 1 / scale) - 1
                 reason = f"the irradiance on the panel is {scale:.2f} times that of the light sensor"
                 text = f"reflectance is uncertain by up to {error:.0%}"
                 is_unusable = error > _MAX_REFLECTANCE_ERROR and is_by_sensor
-                yield Caution(band.band, remedy, reason, min(1.0, error), error, text, is_unusable=is_unusable)
-            if is_old:
+                yield Caution(band, remedy, reason, min(1.0, error), error, text, is_unusable=is_unusable)
+            if age_s > _MAX_PANEL_AGE_S and not is_by_sensor:
                 lost = min(1.0, _CHANGE_OF_LIGHT * age_s / _MAX_PANEL_AGE_S)
                 reason = f"the nearest panel is {age_s / 60:.0f} min away"
-                yield Caution(band.band, remedies.OLD_PANEL, reason, lost, age_s, f"up to {age_s / 60:.0f} min")
+                yield Caution(band, remedies.OLD_PANEL, reason, lost, age_s, f"up to {age_s / 60:.0f} min")
 
     def _sensor_scales(self, captured_at: str) -> dict[str, float]:
         """Irradiance on contradicting panels divided by that of the sensor, by band; the largest difference counts."""

@@ -429,12 +429,16 @@ class IlluminationPart(_Part):
 
 
 class BandRadiometryPart(_Part):
-    """How far the radiance or reflectance of a band can be trusted."""
+    """Quantity and expected error of a band."""
 
     band: Name
     """Its name."""
+    quantity: Name = ""
+    """Such as `reflectance` or `temperature`."""
+    source: Name = ""
+    """Such as `panel and light sensor`."""
     std_percent: Number3
-    """Expected error (1 sigma) of its values, percent: the root of the sum of the squares of `errors`."""
+    """Expected error (1 sigma), percent: root of the sum of the squares of `errors`. Null for a temperature."""
     errors: list[RadiometricError]
     """What its values depend on, with the error by each."""
     cell_means: Annotated[NDArray[np.float64], Array((12, 16), nullable=True)] | None = None
@@ -449,13 +453,13 @@ class OutputPart(_Part):
     bands: list[Name] = []
     """Bands of the stack, in order; missing ones are nodata."""
     radiometry: Name | None = None
-    """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
+    """All quantities and sources, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
     """Time to the nearest panel."""
     illumination: list[IlluminationPart] = []
-    """Bands that were converted to reflectance."""
+    """Bands with reflectance."""
     band_radiometry: list[BandRadiometryPart] = []
-    """Bands that were converted to radiance or reflectance."""
+    """Bands that were converted."""
     crop: tuple[int, int, Count, Count]
     """x0, y0, width, height on the reference grid times `scale`."""
     scale: tuple[Positive, Positive] = (1.0, 1.0)
@@ -470,10 +474,13 @@ class OutputPart(_Part):
     """Implausible tag that made `--radiometry auto` write radiance."""
 
     @property
-    def light_from(self) -> str | None:
-        """The `RadiometrySource` of the light, if the rasters are reflectance or relative reflectance."""
-        quantity, _, source = (self.radiometry or "").partition(" by ")
-        return source if "reflectance" in quantity else None
+    def light_sources(self) -> dict[str, str]:
+        """What the reflectance or relative reflectance of each band is by, for bands that have it; in sidecars without
+        quantities of bands, the text about all bands.
+        """
+        of_all = self.radiometry or ""
+        parts = (part for part in self.band_radiometry if "reflectance" in (part.quantity or of_all))
+        return {part.band: part.source or of_all for part in parts}
 
     def std_percent(self, band: str) -> float | None:
         """Return the expected error of a band's radiance or reflectance, percent; None for another band."""
@@ -576,7 +583,7 @@ class Sidecar(_Part):
     reference: ReferencePart
     """Reference band."""
     bands: Annotated[list[BandResult], Field(min_length=1)]
-    """One entry per band, the reference included."""
+    """All bands, with the reference."""
     parallax: FilePart | None = None
     """Parallax raster on the pixels of the reference."""
     accept_predicted_px: Number

@@ -1,6 +1,7 @@
 """The data that the report shows about each capture."""
 
 import json
+import math
 import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -272,7 +273,7 @@ def _errors(error: ErrorPart | None) -> dict[str, Any]:
 
 def _radiometry(output: OutputPart) -> str | None:
     """The conversion of the raw numbers, with the largest expected error of a band."""
-    errors = [part.std_percent for part in output.band_radiometry]
+    errors = [part.std_percent for part in output.band_radiometry if math.isfinite(part.std_percent)]
     return f"{output.radiometry}, expected error up to {max(errors):.0f} %" if errors else output.radiometry
 
 

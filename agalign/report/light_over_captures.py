@@ -4,7 +4,7 @@ ground agree.
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -52,8 +52,8 @@ class _CaptureCells:
     label: str
     time_s: float
     """Unix time; nan if it is unknown."""
-    quantity: str
-    """Such as `reflectance` or `radiance`."""
+    quantities: Set[str]
+    """Such as `reflectance` or `radiance`, of all bands together."""
     bands: tuple[str, ...]
     cells: Cells
 
@@ -66,8 +66,10 @@ class _CaptureCells:
             return None
         cells = np.array([np.log(c, out=np.full_like(c, np.nan), where=c > 0) for c in usable.values()])
         time_s = known_time_s(captured_at)
-        quantity, _, _ = (output.radiometry or "").partition(" by ")
-        return cls(label, math.nan if time_s is None else time_s, quantity, tuple(usable), cells)
+        quantities = {
+            part.quantity or output.radiometry or "" for part in output.band_radiometry if part.band in usable
+        }
+        return cls(label, math.nan if time_s is None else time_s, quantities, tuple(usable), cells)
 
     def apart_s(self, other: Self) -> float:
         """Return the time between two captures."""
@@ -75,8 +77,9 @@ class _CaptureCells:
 
     def is_comparable(self, other: Self) -> bool:
         """Return True for another capture with the reflectance of the same bands, nearly at the same time."""
-        is_same = self.bands == other.bands and self.quantity == other.quantity
-        return is_same and "reflectance" in self.quantity and self.apart_s(other) <= _MAX_APART_S
+        is_same = self.bands == other.bands and self.quantities == other.quantities
+        are_reflectance = all("reflectance" in quantity for quantity in self.quantities)
+        return is_same and are_reflectance and self.apart_s(other) <= _MAX_APART_S
 
     def jumps(self, other: Self) -> Iterator[Caution]:
         """Yield the bands that differ from another capture over the same ground."""

@@ -14,20 +14,24 @@ import rasterio
 
 import agalign
 from agalign.batch import capture_task
+from agalign.batch.render import _output
 from agalign.batch.run import plan_run
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import content_checksum, find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
+from agalign.values.capture import Band, Capture
 from agalign.values.fields import POSITION_DECIMALS
-from agalign.values.mapping import DisplacementField
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import MappingError
+from agalign.values.radiometric_errors import PANEL
+from agalign.values.radiometry import Radiometry
 
 from ..builders import in_full_run, joint_result, residual_of
 from ..conftest import raising, read_json, seeded
 from ..program import agalign_here
 from ..rasters.test_relief_map import SIZE, Run
-from ..run_outputs import table_in
+from ..run_outputs import aligned, context_of, table_in
 
 pytestmark = pytest.mark.slow
 
@@ -390,3 +394,22 @@ def test_stacks_of_a_camera_have_the_same_bands_in_the_same_order(flight: Path, 
 def _make_constant(path: Path) -> None:
     with rasterio.open(path, "r+") as file:
         file.write(np.full((1, *file.shape), 20_000, file.dtypes[0]))
+
+
+def test_each_band_has_its_quantity_and_its_source() -> None:
+    """A thermal band is the reference; temperatures have no expected error."""
+    thermal, light = Radiometry("temperature", 27315.0, 1.0, 0.01), Radiometry("reflectance", 0.0, 1.0, 1.0)
+    bands = (
+        Band("LWIR", Path("6.tif"), 1, 40, 30, "uint16", radiometry=thermal),
+        Band("NIR", Path("4.tif"), 1, 40, 30, "uint16", radiometry=replace(light, source="panel", errors=(PANEL,))),
+    )
+    capture = Capture("IMG_0001", Path(), bands, 0)
+    context = context_of(capture, {"NIR": aligned(PixelMapping(np.eye(3)), (40, 30))}, radiometry="panel")
+    output = _output(context, {"LWIR": 0.5})
+    assert output.radiometry == "temperature by camera calibration and reflectance by panel"
+    assert output.light_sources == {"NIR": "panel"}
+    parts = [(p.band, p.quantity, p.source, p.std_percent) for p in output.band_radiometry]
+    assert parts[1:] == [("NIR", "reflectance", "panel", 3.0)]
+    assert parts[0][:3] == ("LWIR", "temperature", "camera calibration")
+    assert np.isnan(parts[0][3])
+    assert [part.band for part in output.illumination] == ["NIR"]

@@ -68,9 +68,15 @@ def predicted(std_px: float, kind: str, **facts: Any) -> dict[str, Any]:
 OUTPUT = {"file": "a.tif", "crop": (0, 0, 10, 8), "nodata": None}
 
 
+def reflectance_by(source: str, bands: tuple[str, ...] = ("Green", "NIR"), **facts: Any) -> dict[str, Any]:
+    """The part of a sidecar about bands with reflectance."""
+    of_band = {"quantity": "reflectance", "source": source, "std_percent": 3.0, "errors": []}
+    return OUTPUT | {"band_radiometry": [of_band | {"band": name} for name in bands]} | facts
+
+
 def test_a_good_band_needs_no_check() -> None:
     good = {"prediction": prediction(0.1, 0.2), "share_over_1_px": 0.005, "saturated": 0.001, "moved_share": 0.0005}
-    output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 600.0}
+    output = reflectance_by("panel", panel_age_s=600.0)
     assert cautions(good, output=output) == []
 
 
@@ -144,7 +150,7 @@ def test_the_time_between_exposures_is_that_in_the_tags(flight: Path, tmp_path: 
 
 def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_flight() -> None:
     run = RunFacts((panel("2026-06-21T10:00:00", NIR=1.59, Green=1.0),))
-    output = OUTPUT | {"radiometry": "reflectance by light sensor"}
+    output = reflectance_by("light sensor")
     time = {"captured_at": "2026-06-21T11:00:00"}
     (caution,) = (c for c in cautions(run=run, output=output, **time) if c.band == "NIR")
     assert caution.reason == "the irradiance on the panel is 1.59 times that of the light sensor"
@@ -158,6 +164,27 @@ def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_fli
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "temperature by camera calibration and reflectance by panel",
+        "reflectance by panel and temperature by camera calibration",
+    ],
+)
+def test_an_old_panel_concerns_the_bands_with_reflectance_in_any_order(text: str) -> None:
+    output = reflectance_by("panel", panel_age_s=3600.0)
+    thermal = {"band": "LWIR", "quantity": "temperature", "source": "camera calibration", "std_percent": None}
+    parts = [thermal | {"errors": []}, *output["band_radiometry"]]
+    reason = "the nearest panel is 60 min away"
+    found = [(c.band, c.reason) for c in cautions(output=output | {"radiometry": text, "band_radiometry": parts})]
+    assert found == [("Green", reason), ("NIR", reason)]
+    # An earlier version has the text only, and no part of a thermal band.
+    parts = [{"band": name, "std_percent": 3.0, "errors": []} for name in ("Green", "NIR")]
+    found = [(c.band, c.reason) for c in cautions(output=output | {"radiometry": text, "band_radiometry": parts})]
+    assert found == [("Green", reason), ("NIR", reason)]
+    assert cautions(output=OUTPUT | {"radiometry": "radiance by camera calibration", "band_radiometry": parts}) == []
+
+
+@pytest.mark.parametrize(
     ("choice", "source", "said", "is_unusable"),
     [
         ("sun", "light sensor", "if the panels had the light of the flight, align again with --radiometry panel", True),
@@ -168,7 +195,7 @@ def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_fli
 def test_a_contradiction_has_a_remedy_that_was_not_tried(
     choice: str, source: str, said: str, is_unusable: bool
 ) -> None:
-    output = OUTPUT | {"radiometry": f"reflectance by {source}", "panel_age_s": 60.0}
+    output = reflectance_by(source, panel_age_s=60.0)
     options = {"write": {"radiometry": choice}}
     (caution, *_) = cautions(run=RunFacts((panel(NIR=15.46),)), output=output, options=options)
     assert caution.size_text == "reflectance is uncertain by up to 1446%"
@@ -201,7 +228,7 @@ def test_sidecars_have_the_model_and_the_share_of_uncertain_pixels(aligned_fligh
 def groups() -> Any:
     """A run with a failed band, three blurred ones, and a panel that contradicts the sensor by 10 %."""
     totals = PairTotals(RunFacts((panel(Red=1.1),)))
-    output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 60.0}
+    output = reflectance_by("panel", ("NIR", "Red"), panel_age_s=60.0)
     blurred = predicted(0.02, "retrieval", reason="blurred")
     for number in range(3):
         red = ALIGNED | {"band": "Red"} | ({"status": "failed", "reason": "blank"} if number == 0 else {})
@@ -282,9 +309,7 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
 
 def calibrated_output(**errors: tuple[float, str]) -> dict[str, Any]:
     parts = [{"name": name, "std_percent": size, "state": state} for name, (size, state) in errors.items()]
-    band = {"band": "NIR", "std_percent": 20.0, "errors": parts}
-    crop = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan"}
-    return crop | {"radiometry": "reflectance by light sensor", "band_radiometry": [band]}
+    return reflectance_by("light sensor", band_radiometry=[{"band": "NIR", "std_percent": 20.0, "errors": parts}])
 
 
 @pytest.mark.parametrize(
@@ -297,9 +322,9 @@ def test_what_values_are_not_corrected_for_is_a_caution(state: str, cause: str) 
 
 
 def test_radiance_instead_of_reflectance_is_unusable_in_every_band() -> None:
-    band = {"band": "Red", "std_percent": 20.0, "errors": []}
-    output = calibrated_output()
-    output |= {"without_reflectance": "NIR: is negative", "band_radiometry": [*output["band_radiometry"], band]}
-    found = cautions(output=output | {"radiometry": "radiance by camera calibration"})
+    bands = [{"band": name, "std_percent": 20.0, "errors": []} for name in ("NIR", "Red")]
+    thermal = {"band": "LWIR", "quantity": "temperature", "std_percent": None, "errors": []}
+    output = OUTPUT | {"without_reflectance": "NIR: is negative", "band_radiometry": [thermal, *bands]}
+    found = cautions(output=output)
     assert [(c.band, c.lost, c.is_unusable) for c in found] == [("NIR", 1.0, True), ("Red", 1.0, True)]
     assert {c.reason for c in found} == {"not written as reflectance: NIR: is negative"}

@@ -45,11 +45,15 @@ def add(
 ) -> list[Caution]:
     """The cautions about the light of a capture, one each `seconds`."""
     at = np.datetime64("2024-06-01T12:00:00.000") + np.timedelta64(int(1000 * seconds * number), "ms")
-    bands = [
-        {"band": name, "std_percent": 3.0, "errors": [], "cell_means": None if name in dark else means.tolist()}
+    quantity, _, source = radiometry.partition(" by ")
+    facts = {"quantity": quantity, "source": source, "std_percent": 3.0, "errors": []}
+    bands: list[dict[str, Any]] = [{"band": "LWIR", **facts, "quantity": "temperature", "std_percent": None}]
+    bands += [
+        {"band": name, **facts, "cell_means": None if name in dark else means.tolist()}
         for name, means in zip(BANDS, cells, strict=True)
     ]
-    output = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan", "radiometry": radiometry, "band_radiometry": bands}
+    text = f"temperature by camera calibration and {radiometry}"
+    output = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan", "radiometry": text, "band_radiometry": bands}
     camera = {"make": "DJI", "model": "FC6360", "lens_calibration": unit}
     found = totals.add(f"IMG_{number:04d}", example(output=output, captured_at=f"{at}+00:00", camera=camera))
     return [caution for caution in found if caution.remedy is JUMP]
