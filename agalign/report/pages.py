@@ -93,7 +93,8 @@ def _add_captures(
     out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], object]
 ) -> list[IndexReport]:
     """Add all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows."""
-    earlier = current_rows(out)
+    # An index that could not be calculated has no raster, whose removal would remove the row.
+    earlier = [row for row in current_rows(out) if row.path is not None or (out / f"{row.capture}.json").is_file()]
     rows_of: dict[str, list[IndexReport]] = defaultdict(list)
     for row in earlier:
         rows_of[row.capture].append(row)

@@ -477,3 +477,15 @@ def test_an_index_that_cannot_be_written_does_not_cost_the_others(
     assert unwritten.problem == "the disk is full"
     listed = [part.file for part in read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products]
     assert [r.path.name in listed for r in (written, last)] == [True, True]
+
+
+def test_the_table_has_no_failure_of_a_capture_that_is_gone(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 2)
+    captures = [read_sidecar(path).capture for path in sorted(tmp_path.rglob("*.json"))]
+    update_table(tmp_path, [IndexReport(f"0000SET/{name}", "ndre", problem="the disk is full") for name in captures])
+    write_pages(tmp_path, pytest.fail)
+    assert [row["capture"] for row in table_in(tmp_path / "indices.csv")] == captures
+    for path in tmp_path.rglob(f"{captures[0]}*"):
+        path.unlink()
+    write_pages(tmp_path, pytest.fail)
+    assert [row["capture"] for row in table_in(tmp_path / "indices.csv")] == captures[1:]
