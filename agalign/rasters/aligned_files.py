@@ -165,13 +165,18 @@ def _written(
     kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags
 ) -> WrittenFile:
     """Write layers as the bands of one file, and return it."""
-    nodata, grey_of = write_raster(context, layers, path, tags)
+    nodata, grey_of = write_raster(context, layers, path, tags, is_stack=kind == Stack.kind)
     bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
     return WrittenFile(kind, path, bands, nodata, is_flat=is_flat, grey=grey_of)
 
 
 def write_raster(
-    context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags | None = None
+    context: ProductContext,
+    layers: Sequence[Layer],
+    path: Path,
+    tags: TransferredTags | None = None,
+    *,
+    is_stack: bool = False,
 ) -> tuple[float | None, Mapping[str, Grey]]:
     """Write layers of a capture as the bands of one file atomically; return its nodata value, and the bands as grey
     images by name where these need no reduction.
@@ -184,7 +189,6 @@ def write_raster(
     capture, settings, raw = context.capture, context.settings.write, context.is_raw
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(context, layers, dtype)
-    is_stack = settings.layout != "bands" and len(layers) >= len(capture.bands)
     compression = compression_of(settings.compression, is_stack=is_stack)
     options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
     options |= compressed(dtype.kind, compression)

@@ -12,7 +12,7 @@ import rasterio
 from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
-from agalign.rasters.aligned_files import write_raster
+from agalign.rasters.aligned_files import BandFiles, Stack, write_raster
 from agalign.rasters.geotiff import Block, LayerDescription, write_on_grid
 from agalign.rasters.output_grid import Layer, common_grid, flight_limits, output_layers
 from agalign.values import geometry
@@ -80,6 +80,21 @@ def test_the_reference_is_bit_identical_and_the_type_kept(tmp_path: Path, dtype:
         assert (written.crs, written.transform.is_identity) == (None, True)
         np.testing.assert_equal(written.nodata, np.nan if dtype == "float32" else None)
     assert not list(tmp_path.glob("*.aux.xml"))
+
+
+@pytest.mark.parametrize("layout", ["both", "bands"])
+@pytest.mark.parametrize("number", [3, 2])
+def test_files_of_bands_have_one_compression(tmp_path: Path, layout: str, number: int) -> None:
+    """A file of the input has all bands of a capture, of which one may have failed."""
+    write_band(tmp_path / "in.tif", np.ones((3, 150, 200), np.uint16))
+    capture = make_capture(tmp_path)
+    bands = [replace(b, path=tmp_path / "in.tif", band_index=k, one_lens=True) for k, b in enumerate(capture.bands, 1)]
+    capture = replace(capture, bands=tuple(bands))
+    context = context_of(capture, {}, tmp_path / "out", layers_of(capture)[:number], CROP, layout=layout)
+    for product, compression in ((Stack(), "zstd"), (BandFiles(), "deflate")):
+        (written,) = product.write(context)
+        with rasterio.open(written.path) as file:
+            assert (file.count, file.profile["compress"]) == (number, compression)
 
 
 def test_red_green_and_blue_are_shown_as_such(tmp_path: Path) -> None:
