@@ -13,6 +13,7 @@ from agalign.cli.command import Command, Given
 from agalign.cli.config_file import load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
 from agalign.host.processes import usable_cores
+from agalign.host.text import counted
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 
 _command = partial(
@@ -113,7 +114,9 @@ def _demo(
 
     source, target = out / "flight", out / "aligned"
     prepare_output(source)
-    terminal.event("make", f"Rendering a synthetic flight: {captures} captures of 5 bands …", captures=captures)
+    terminal.event(
+        "make", f"Rendering a synthetic flight: {counted(captures, 'capture')} of 5 bands …", captures=captures
+    )
     settings = Settings.model_validate(given["settings"])
     truth = make_flight(source, captures, rng_seed=settings.joint.rng_seed)
     flight = find_captures(source, DiscoverOptions(), terminal)

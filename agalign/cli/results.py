@@ -92,7 +92,8 @@ def _verify(terminal: Terminal, out: Out) -> int:
         for text in problems:
             terminal.problem(text)
     is_unfinished = _print_unfinished(out, set(labels), terminal)
-    terminal.result(f"{len(labels) - damaged} of {len(labels)} captures match their checksums")
+    match = "matches its" if len(labels) == 1 else "match their"
+    terminal.result(f"{len(labels) - damaged} of {counted(len(labels), 'capture')} {match} checksums")
     return ExitCode.PARTIAL if damaged or is_unfinished else ExitCode.OK
 
 
@@ -125,7 +126,7 @@ def _export(
     for line in report.notes:
         terminal.result(line)
     terminal.event("export", captures=report.captures, files=len(report.files), folder=str(folder))
-    terminal.result(f"{report.captures} captures, {len(report.files)} files in {folder}")
+    terminal.result(f"{counted(report.captures, 'capture')}, {counted(len(report.files), 'file')} in {folder}")
     return ExitCode.PARTIAL if report.left_out or is_unfinished else ExitCode.OK
 
 
@@ -134,7 +135,7 @@ def _print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> 
     for label, reason in left_out[:MAX_LISTED]:
         terminal.problem(f"{label}: left out: {reason}", capture=label)
     if len(left_out) > MAX_LISTED:
-        terminal.problem(f"{len(left_out) - MAX_LISTED} more captures are left out")
+        terminal.problem(f"left out: {counted(len(left_out) - MAX_LISTED, 'more capture')}")
 
 
 report = Command(_report)
@@ -212,7 +213,7 @@ def _conclude(
     elif written:
         _print_table(names, reports, terminal)
         if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
-            more = f" and {len(masked) - 1} more captures" if masked[1:] else ""
+            more = f" and {counted(len(masked) - 1, 'more capture')}" if masked[1:] else ""
             terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
         if doubtful := [r for r in written if r.problem]:
             first = f"{doubtful[0].capture} {doubtful[0].index}: {doubtful[0].problem}"

@@ -176,7 +176,7 @@ def explain(groups: "Sequence[CautionGroup]", terminal: Terminal) -> None:
         terminal.event("check", "Check these, the largest effect first:", causes=len(groups))
     for group in groups:
         status, first = group.status.replace("_", " "), group.bands[0]
-        if len(group.bands) == 1:
+        if group.pairs == 1:
             name = f"{first.capture} {first.band}".rstrip()
             text, named = f"{name}: {status}: {first.reason}", []
         else:
@@ -184,7 +184,7 @@ def explain(groups: "Sequence[CautionGroup]", terminal: Terminal) -> None:
             text = f"{status}: {group.count}: {group.remedy.cause}{size}"
             names = some_of((f"{b.capture} {b.band}".rstrip() for b in group.bands), max_named)
             named = [f"{names}: {first.reason}"]
-        facts = {"bands": len(group.bands), "captures": group.captures, "advice": group.advice}
+        facts = {"bands": group.pairs, "captures": group.captures, "advice": group.advice}
         facts |= {"cause": group.remedy.cause, "size": group.size, "effect": round(group.effect, 4)}
         terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **facts)
 

@@ -71,6 +71,8 @@ class Caution:
     """The values are too uncertain for any use, or radiance instead of reflectance: the run returns exit code 3."""
     capture: str = ""
     """Label of the capture."""
+    captures: int = 1
+    """Number of captures that it is about, of which `capture` is one."""
 
 
 def models_in(out: Path) -> dict[Path, str]:

@@ -129,7 +129,7 @@ class LightOverCaptures:
                 reason = f"in {count} captures, the corners are {share:+.0%} from the middle (± {std:.0%})"
                 lost = min(1.0, abs(share)) * count
                 size, last = f"up to {abs(share):.0%}", self._recent[camera][-1].label
-                yield Caution(band, NOT_FLAT, reason, lost, abs(share), size, capture=last)
+                yield Caution(band, NOT_FLAT, reason, lost, abs(share), size, capture=last, captures=count)
 
 
 def same_ground(one: Cells, other: Cells, *, is_certain: bool) -> NDArray[np.float64] | None:

@@ -63,13 +63,18 @@ class CautionGroup:
     @property
     def captures(self) -> int:
         """Number of captures with such a band."""
-        return len({b.capture for b in self.bands})
+        return sum({b.capture: b.captures for b in self.bands}.values())
+
+    @property
+    def pairs(self) -> int:
+        """Number of its bands, each counted in every capture."""
+        return sum(b.captures for b in self.bands)
 
     @property
     def count(self) -> str:
         """The number of its bands and captures, in words."""
         captures = counted(self.captures, "capture")
-        return captures if self.status == "no_result" else f"{counted(len(self.bands), 'band')} of {captures}"
+        return captures if self.status == "no_result" else f"{counted(self.pairs, 'band')} of {captures}"
 
 
 @dataclass
@@ -207,4 +212,4 @@ class PairTotals:
         values = max(1.0, pairs + pairs_without_result * len(without_result))
         groups = [CautionGroup(*cause, bands, sum(b.lost for b in bands) / values) for cause, bands in by_cause.items()]
         severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
-        return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
+        return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -g.pairs, g.remedy.cause))

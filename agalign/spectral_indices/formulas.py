@@ -217,7 +217,8 @@ def index_of_formula(text: str) -> Index:
     name, equals, formula = text.partition("=")
     name, formula = (name.strip().lower(), formula) if equals else ("formula", text)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in INDICES:
-        raise ConfigurationError(f"'{name}' cannot name a formula; use letters, digits and _, and no index's name")
+        allowed = "a letter, then up to 30 letters, digits or _, and not the name of an index"
+        raise ConfigurationError(f"'{name}' cannot name a formula; use {allowed}")
     return _checked(Index(name, formula.strip(), source=_OF_USER))
 
 

@@ -75,6 +75,14 @@ def test_the_commands_on_a_run_name_its_state_and_the_captures_without_a_result(
         shutil.rmtree(out.parent / "exported", ignore_errors=True)
 
 
+def test_one_capture_is_counted_in_the_singular(out: Path) -> None:
+    change(out / "agalign-run.json", labels=[FIRST])
+    for path in out.glob(f"{SECOND}*"):
+        path.unlink()
+    assert "1 of 1 capture matches its checksums" in agalign_here("verify", out).stdout
+    assert "1 capture, 5 files in " in agalign_here(*arguments("export", out)).stdout
+
+
 def images_of_first(folder: Path) -> list[Path]:
     return sorted(folder.rglob("IMG_0001_*.tif"))
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from agalign.cli.terminal import Terminal, explain
 from agalign.records.cautions import Caution
 from agalign.report.pair_totals import PairTotals
 from agalign.values.remedies import JUMP, NOT_FLAT
@@ -113,13 +114,15 @@ def darker_corners(ratio: float) -> Image:
     return np.asarray(0.2 * np.stack([np.ones_like(r), np.ones_like(r), falloff]))
 
 
-def test_two_cameras_of_a_model_are_told_apart() -> None:
+def test_two_cameras_of_a_model_are_told_apart(capsys: pytest.CaptureFixture[str]) -> None:
     totals = PairTotals()
     for k in range(50):
         add(totals, k, darker_corners(0.75 if k < 25 else 1.0), unit="first" if k < 25 else "second")
     (group,) = (g for g in totals.groups() if g.remedy is NOT_FLAT)
     assert [(b.band, b.capture) for b in group.bands] == [("NIR", "IMG_0024")]
     assert "in 25 captures, the corners are -25%" in group.bands[0].reason
+    explain([group], Terminal())
+    assert "check: 25 bands of 25 captures: the mean of the captures is darker" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -137,6 +140,7 @@ def test_the_mean_of_many_captures_shows_whether_the_vignetting_is_corrected(
     if is_named:
         assert [b.band for b in groups[0].bands] == ["NIR"]
         assert f"in {captures} captures, the corners are" in groups[0].bands[0].reason
+        assert groups[0].count == f"{captures} bands of {captures} captures"
         assert groups[0].effect == pytest.approx(abs(mean - 1), abs=0.1)
 
 

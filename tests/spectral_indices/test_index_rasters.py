@@ -90,6 +90,7 @@ def test_the_index_before_alignment_is_that_of_the_files(tmp_path: Path) -> None
         ("ndvi=N/R", "'ndvi' cannot name"),
         ("../x=N/R", "'../x' cannot name"),
         ("N+", "is not a formula"),
+        ("2band=N/R", "'2band' cannot name a formula; use a letter, then up to 30 letters, digits or _"),
     ],
 )
 def test_a_formula_is_arithmetic_of_bands_and_nothing_else(text: str, problem: str) -> None:
