@@ -180,10 +180,14 @@ def _indices(
     terminal.event("found", captures=len(tasks), indices=len(chosen))
     dask, problem = given["run"]["executor"], ""
     reports: list[IndexReport] = []
+    are_raw = False
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         try:
             for number, done in enumerate(run_indices(tasks, jobs, executor, terminal.problem), start=1):
-                _print_capture(done, reports, terminal)
+                terminal.check()
+                if not are_raw and (are_raw := any(r.raw_numbers for r in done)):
+                    terminal.problem(RAW_NUMBERS)
+                _print_capture(done, terminal)
                 reports += done
                 show(number, done[0].capture, 0)
         except (OutputError, WorkerError) as error:  # the rasters that were reported, and their statistics, exist
@@ -232,11 +236,8 @@ indices = Command(
 )
 
 
-def _print_capture(reports: "Sequence[IndexReport]", earlier: "Sequence[IndexReport]", terminal: Terminal) -> None:
-    """Print the indices of a capture, after those of `earlier` ones."""
-    terminal.check()
-    if any(r.raw_numbers for r in reports) and not any(r.raw_numbers for r in earlier):
-        terminal.problem(RAW_NUMBERS)
+def _print_capture(reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
+    """Print the indices of a capture."""
     for report in reports:
         if report.path is None:
             terminal.problem(

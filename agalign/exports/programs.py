@@ -72,7 +72,7 @@ def export(out: Path, target: Path, program: ExportProgram, *, copy: bool = Fals
     captures, left_out = captures_of_run(out)
     good = [c for c in captures if c.result.status == "ok"]
     # A misaligned band harms a reconstruction more than a missing capture.
-    left_out += [(c.label, f"its status is {c.result.status}") for c in captures if c not in good]
+    left_out += [(c.label, f"its status is {c.result.status}") for c in captures if c.result.status != "ok"]
     good, differing = like_most(good)
     changed = [(c.label, problem) for c in good if (problem := _changed_band_file(c, out))]
     good = [c for c in good if c.label not in dict(changed)]
