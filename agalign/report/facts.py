@@ -80,18 +80,18 @@ class FlightFacts:
         """Centres of windows, which many pairs share, and their index, of the current part of the details."""
         self._first_lattice = 0
 
-    def add(self, folder: str, sidecar: Sidecar, indices: Sequence[IndexReport] = ()) -> None:
-        """Add a capture, given its folder relative to the output folder, and its indices. Raises OutputError."""
-        label = Path(folder, sidecar.capture).as_posix()
+    def add(self, label: str, sidecar: Sidecar, indices: Sequence[IndexReport] = ()) -> None:
+        """Add a capture, given its label, and its indices. Raises OutputError."""
+        folder = Path(label).parent
         checks: dict[str, list[str]] = defaultdict(list)
         # The page has links by the label that it shows.
         for caution in self.pairs.add(escape_controls(label), sidecar):
             checks[caution.band].append(caution.reason)
-        keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
+        keys = {"folder": folder.as_posix(), "capture": sidecar.capture, "reference": sidecar.reference.band}
         unwritten = list(unwritten_indices(sidecar, self.out / folder, indices))
         for name, why in unwritten:
             self.unwritten[name].append((escape_controls(label), why))
-        facts = _of_capture(Path(folder), label, sidecar) | {
+        facts = _of_capture(folder, label, sidecar) | {
             "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
             "unwritten": unwritten,

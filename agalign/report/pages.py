@@ -101,7 +101,7 @@ def _add_captures(
     indices: list[IndexReport] = []
     changed: set[Path] = set()
     for path, sidecar, states in _results(out, on_problem):
-        folder = path.parent.relative_to(out).as_posix()
+        label = label_of(path, out)
         listed = ListedFiles.of(sidecar, path.parent, states)
         # The report needs no stacks: these may be deleted.
         problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}
@@ -109,11 +109,11 @@ def _add_captures(
             on_problem(problem)
         changed |= problems.keys()
         sidecar = _without(sidecar, path.parent, problems)
-        of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
+        of_capture = reports_of(sidecar, label, out, facts.pairs.run)
         indices += of_capture
-        rows = [row for row in rows_of.get(label_of(path, out), []) if row.path not in changed]
-        facts.add(folder, sidecar, merged(rows, of_capture))
-        flight_map.add(folder, sidecar)
+        rows = [row for row in rows_of.get(label, []) if row.path not in changed]
+        facts.add(label, sidecar, merged(rows, of_capture))
+        flight_map.add(Path(label).parent.as_posix(), sidecar)
     return update_table(out, indices, [row for row in earlier if row.path not in changed])
 
 

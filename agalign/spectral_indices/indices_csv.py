@@ -39,17 +39,16 @@ def to_check(index: Index | None, unit: str, sidecar: Sidecar, run: RunFacts, la
     return "; ".join(result)
 
 
-def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[IndexReport]:
-    """Return the indices of a capture that its sidecar lists, from the tags of the rasters, which are as they were
-    written.
+def reports_of(sidecar: Sidecar, label: str, out: Path, run: RunFacts) -> list[IndexReport]:
+    """Return the indices of a capture that its sidecar lists, given its label, from the tags of the rasters, which are
+    as they were written.
     """
     result = []
     for part in sidecar.products:
-        path = out / folder / part.file
+        path = (out / label).parent / part.file
         if part.kind == "index" and path.suffix == ".tif":
             name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
             if (raster := IndexRaster.read(path)) is not None:
-                label = Path(folder, sidecar.capture).as_posix()
                 problem = to_check(raster.index, raster.statistics.unit, sidecar, run, label)
                 report = IndexReport(label, name, path, raster.statistics, problem, is_masked=raster.is_masked)
                 result.append(report.of(sidecar))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.records.sidecar_file import find_sidecars, read_sidecar
+from agalign.records.sidecar_file import find_sidecars, label_of, read_sidecar
 from agalign.synthetic import cameras
 from agalign.synthetic.cameras import REDEDGE, BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance
@@ -228,7 +228,7 @@ def score_against_truth(out: Path, truth_path: Path) -> list[Score]:
     truth = json.loads(truth_path.read_text(encoding="utf-8"))
     scores = []
     for path in find_sidecars(out):
-        sidecar, label = read_sidecar(path), path.relative_to(out).with_suffix("").as_posix()
+        sidecar, label = read_sidecar(path), label_of(path, out)
         if sidecar.capture not in truth:  # of an earlier demo with more captures in the same folder
             continue
         for band in sidecar.bands:
