@@ -1,7 +1,7 @@
 """The captures of a run by their sidecars: their bands, with file and index, and the captures that differ from most."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +31,11 @@ class AlignedBand:
     """Quality raster whose flagged pixels become nan: file, index of the band's layer, checksum of the file."""
 
 
+def quality_layers(bands: Iterable[str]) -> dict[str, int]:
+    """Return the layer of each band in a quality raster, from 1, given the bands in the order of the stack."""
+    return {name: number for number, name in enumerate(bands, start=2)}  # layer 1 is that of all bands together
+
+
 def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[AlignedBand]:
     """Return the bands of a capture, given the folder of its sidecar; with `mask_qa` with their quality flags.
 
@@ -43,7 +48,7 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
     result, names = [], [part.band for part in sidecar.bands]
     if sidecar.output is not None:
         names = sidecar.output.bands or names
-    layers = {name: number for number, name in enumerate(names, start=2)}  # layer 1 is that of all bands together
+    layers = quality_layers(names)
     for part in sidecar.bands:
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layers[part.band], flags.sha256) if mask_qa and flags is not None else None

@@ -28,7 +28,7 @@ from agalign.rasters.aligned_files import tags_of
 from agalign.rasters.band_reader import RAW, BandReader
 from agalign.rasters.drawing import with_text, write_png
 from agalign.rasters.product import CapturePaths, LostFile, Product, ProductContext, WrittenFile
-from agalign.records.captures import AlignedBand, bands_of
+from agalign.records.captures import AlignedBand, bands_of, quality_layers
 from agalign.records.listed_files import ListedFiles
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.before_alignment import index_before
@@ -244,7 +244,7 @@ def _bands(context: ProductContext) -> Iterator[AlignedBand]:
 def _masked(bands: Sequence[AlignedBand], context: ProductContext) -> Iterator[AlignedBand]:
     """Yield bands with the quality raster that this rendering has written."""
     raster = next((file for file in context.written if file.kind == "qa"), None)
-    layers = {layer.band.name: number for number, layer in enumerate(context.layers, start=2)}  # layer 1: all bands
+    layers = quality_layers(layer.band.name for layer in context.layers)
     for band in bands:
         if raster is None:
             yield replace(band, problem="its quality raster does not exist")
