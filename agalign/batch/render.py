@@ -55,7 +55,7 @@ _FOOTPRINT_DECIMALS = 7
 def with_earlier_products(settings: WriteSettings, sidecar: Sidecar) -> WriteSettings:
     """Return the settings with the products that an earlier command has added; deleted ones are restored."""
     kinds = {part.kind for part in sidecar.products}
-    earlier = (sidecar.options or {}).get("write", {})
+    earlier = sidecar.write_options
     return settings.model_copy(
         update={name: True for name, kind in _ADDED.items() if earlier.get(name) and kind in kinds}
     )

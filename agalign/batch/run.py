@@ -420,7 +420,7 @@ class _FlightRun:
         """Return the grid of the rasters of an earlier result if this run makes the same; None without any."""
         if left.earlier is None or left.earlier.output is None:
             return None
-        before = (left.earlier.options or {}).get("write", {})
+        before = left.earlier.write_options
         now = self.settings.write.model_dump(mode="json", exclude_defaults=True)
         is_same = all(before.get(name) == now.get(name) for name in ("crop", "resolution", "undistort"))
         return left.earlier.output.grid if is_same else None

@@ -138,7 +138,7 @@ class RunFacts:
                 yield Caution(band_part.band, _WITHOUT_REFLECTANCE, reason, 1.0, is_unusable=True)
         scales = self._sensor_scales(sidecar.captured_at)
         age_s = output.panel_age_s or 0.0
-        choice = (sidecar.options or {}).get("write", {}).get("radiometry", "auto")
+        choice = sidecar.write_options.get("radiometry", "auto")
         remedy = remedies.CONTRADICTING_LIGHT.get(choice, remedies.CONTRADICTING_LIGHT["auto"])
         for band, source in output.light_sources.items():
             is_by_sensor = "light sensor" in source

@@ -680,6 +680,11 @@ class Sidecar(_Part):
         return max(known_px, default=None)
 
     @property
+    def write_options(self) -> dict[str, Any]:
+        """Settings of the last rendering that differ from the defaults."""
+        return (self.options or {}).get("write", {})
+
+    @property
     def files(self) -> list[FilePart]:
         """All files of the capture."""
         return [*self.products, *([] if self.parallax is None else [self.parallax])]

@@ -350,7 +350,7 @@ def unwritten_indices(sidecar: Sidecar, folder: Path, reports: Sequence[IndexRep
     """
     problems = {report.index: report.problem for report in reports if report.path is None}
     written = {report.index for report in reports} - problems.keys()
-    requested = (sidecar.options or {}).get("write", {}).get("indices", [])
+    requested = sidecar.write_options.get("indices", [])
     for name in dict.fromkeys([*map(str, requested), *problems]):
         if name not in written:
             before = f"when it was last calculated: {problems[name]}" if name in problems else _NO_RASTER
