@@ -25,7 +25,7 @@ from agalign.host.own_files import foreign, is_own_file, refuse_foreign
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
-from agalign.records.excluded import EXCLUDED_FILES
+from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES
 from agalign.records.run_record import file_states
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import OtherSchemaError, find_sidecars, is_sidecar, read_with_change
@@ -202,7 +202,7 @@ def refuse_foreign_pages(out: Path) -> None:
     """Raise ConfigurationError for a file with the name of that of panels or sky that no run wrote, and if a folder
     without record and results of a run has files with the names of its pages.
     """
-    for name, start in EXCLUDED_FILES.items():
+    for name, start in PANEL_AND_SKY_FILES.items():
         refuse_foreign(out / name, (start,))
     if (out / RUN_FILE).exists() or find_sidecars(out):
         return

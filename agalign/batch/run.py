@@ -37,8 +37,8 @@ from agalign.host.text import counted, name_problem
 from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.product import CapturePaths, RenderOptions
-from agalign.records.excluded import last_excluded
 from agalign.records.listed_files import states_of
+from agalign.records.panels_and_sky import last_panels_and_sky
 from agalign.records.run_record import Finished, RunPart, RunState, begun, input_name, last_record
 from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages, pages_exist, write_pages
@@ -306,7 +306,7 @@ class _FlightRun:
         not aligned, with reports.
         """
         others = {label for labels in record.other_inputs.values() for label in labels}
-        earlier_panels, earlier_sky = last_excluded(self.out)
+        earlier_panels, earlier_sky = last_panels_and_sky(self.out)
         parts_of_sky = write_sky(sky, self.out, [part for part in earlier_sky if part.label in others])
         parts_of_panels = write_panels(panels, self.out, [part for part in earlier_panels if part.label in others])
         gone = {part.label for part in earlier_panels} - others.union(part.label for part in parts_of_panels)

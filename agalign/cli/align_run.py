@@ -22,7 +22,7 @@ from agalign.errors import InputError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.host.files import REPORT_FILE
 from agalign.host.text import counted, escape_controls
-from agalign.records.excluded import exclusions, last_excluded
+from agalign.records.panels_and_sky import exclusions, last_panels_and_sky
 from agalign.records.run_record import RunPart
 from agalign.records.sidecar import BandResult
 from agalign.report.pages import pair_totals
@@ -270,7 +270,7 @@ def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
 
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
-    excluded = [part for parts in last_excluded(out) for part in parts if part.is_left_out]
+    excluded = [part for parts in last_panels_and_sky(out) for part in parts if part.is_left_out]
     _print_totals(totals, {part.label for part in excluded}, terminal)
     for reason, paths in totals.removed.items():
         terminal.problem(f"{counted(len(paths), 'file')} of an earlier command removed, such as {paths[0]}: {reason}")

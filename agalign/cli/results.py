@@ -57,11 +57,11 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
     them are not in its input; return True if it did not do all.
     """
     from agalign.errors import SidecarError
-    from agalign.records.excluded import read_excluded
+    from agalign.records.panels_and_sky import read_panels_and_sky
     from agalign.records.run_record import read_run_record, unfinished_run
 
     try:
-        panels, sky = read_excluded(out)
+        panels, sky = read_panels_and_sky(out)
         record = read_run_record(out)
         unfinished = unfinished_run(record, (*panels, *sky), labels)
     except SidecarError as error:

@@ -14,7 +14,7 @@ from agalign.errors import InputError
 from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
 from agalign.flight.rig_file import model_fingerprint
 from agalign.host.files import MODELS_FOLDER
-from agalign.records.excluded import PanelPart, last_excluded
+from agalign.records.panels_and_sky import PanelPart, last_panels_and_sky
 from agalign.records.run_record import last_record
 from agalign.records.sidecar import BandRadiometryPart, BandResult, Sidecar
 from agalign.values import remedies
@@ -98,7 +98,7 @@ class RunFacts:
     @classmethod
     def of(cls, out: Path) -> "RunFacts":
         """Read the facts of a run; files that cannot be read are left out."""
-        models, record, (panels, _) = models_in(out), last_record(out), last_excluded(out)
+        models, record, (panels, _) = models_in(out), last_record(out), last_panels_and_sky(out)
         gone = frozenset[str]() if record is None else frozenset(part.capture for part in record.not_in_input)
         return cls(tuple(p for p in panels if not p.fits_sensor), frozenset(models.values()), gone)
 

@@ -20,7 +20,7 @@ from agalign.host.files import RUN_FILE, read_model, read_regular, write_model
 from agalign.host.libraries import library_versions
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted, escape_controls, shortened, some_of
-from agalign.records.excluded import ExcludedPart
+from agalign.records.panels_and_sky import PanelOrSkyPart
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import label_of
 from agalign.values.capture import Capture
@@ -295,7 +295,7 @@ class UnfinishedRun:
 
 
 def unfinished_run(
-    record: RunPart | None, not_aligned: Iterable[ExcludedPart], labels: Collection[str]
+    record: RunPart | None, not_aligned: Iterable[PanelOrSkyPart], labels: Collection[str]
 ) -> UnfinishedRun | None:
     """Return what the last run into a folder did not do, given its panels and captures of the sky, and the labels of
     the captures that have a result; None without a record.

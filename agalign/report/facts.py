@@ -19,7 +19,7 @@ from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.host.text import escape_controls
 from agalign.rasters.preview import ERROR_FULL_PX
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, RunFacts
-from agalign.records.excluded import PanelPart, SkyPart
+from agalign.records.panels_and_sky import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
 from agalign.report.pair_totals import CautionGroup, PairTotals, usable_bands

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.host.files import FLIGHT_MAP_FILE, write_text
-from agalign.records.excluded import ExcludedPart
+from agalign.records.panels_and_sky import PanelOrSkyPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.summary_csv import rounded
 from agalign.spectral_indices.rasters import IndexReport
@@ -60,7 +60,7 @@ class FlightMap:
             },
         )
 
-    def add_excluded(self, part: ExcludedPart) -> None:
+    def add_excluded(self, part: PanelOrSkyPart) -> None:
         """Add a capture that is not aligned, as it shows a panel or the sky."""
         facts = _place(part.camera, part.captured_at, part.position, part.pose)
         shape = geojson_geometry(part.footprint, part.position)

@@ -21,8 +21,8 @@ from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
 from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
-from agalign.records.excluded import PanelPart, SkyPart, exclusions, read_excluded
 from agalign.records.listed_files import ListedFiles
+from agalign.records.panels_and_sky import PanelPart, SkyPart, exclusions, read_panels_and_sky
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import find_sidecars, label_of, place_problem, read_sidecar
@@ -55,7 +55,7 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     sky: list[SkyPart] = []
     run: RunPart | None = None
     try:
-        (panels, sky), run = read_excluded(out), read_run_record(out)
+        (panels, sky), run = read_panels_and_sky(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
     excluded: list[PanelPart | SkyPart] = [*(one for one in panels if one.is_left_out), *sky]

@@ -15,7 +15,7 @@ from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.host.files import PANELS_FILE, SKY_FILE, check_inside, write_model
 from agalign.pixels.raster import read_preview
 from agalign.rasters.drawing import Picture, side_by_side, titled, write_png
-from agalign.records.excluded import PanelPart, PanelsFile, SkyFile, SkyPart
+from agalign.records.panels_and_sky import PanelPart, PanelsFile, SkyFile, SkyPart
 from agalign.values.capture import Band, Capture, source_file
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale

@@ -28,7 +28,7 @@ from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
 from agalign.host.files import PANELS_FILE, write_model
 from agalign.records.cautions import RunFacts
-from agalign.records.excluded import PanelPart, PanelsFile
+from agalign.records.panels_and_sky import PanelPart, PanelsFile
 from agalign.records.run_record import Finished, RunPart, begun
 from agalign.records.sidecar_file import write_sidecar
 from agalign.report.pages import pair_totals

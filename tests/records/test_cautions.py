@@ -15,7 +15,7 @@ from agalign.cli.terminal import Terminal, explain
 from agalign.flight.rig_file import model_fingerprint
 from agalign.rasters.alignment_maps import error_lattice_px, share_over_1_px
 from agalign.records.cautions import Caution, RunFacts
-from agalign.records.excluded import PanelPart
+from agalign.records.panels_and_sky import PanelPart
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.report.pages import write_pages

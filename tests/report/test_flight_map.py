@@ -25,7 +25,7 @@ from agalign.flight.footprint import (
     with_approximate_georeference,
     with_assumed_height,
 )
-from agalign.records.excluded import SkyPart
+from agalign.records.panels_and_sky import SkyPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.flight_map import FlightMap, geojson_geometry
 from agalign.report.pages import write_pages

@@ -50,7 +50,7 @@ class SkyBandPart(_Part):
     """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
 
 
-class ExcludedPart(_Part):
+class PanelOrSkyPart(_Part):
     """A capture of a panel or of the sky."""
 
     kind: ClassVar[str]
@@ -78,7 +78,7 @@ class ExcludedPart(_Part):
         return True
 
 
-class PanelPart(ExcludedPart):
+class PanelPart(PanelOrSkyPart):
     """One capture of a panel."""
 
     kind = "panel"
@@ -143,7 +143,7 @@ class PanelPart(ExcludedPart):
         return text
 
 
-class SkyPart(ExcludedPart):
+class SkyPart(PanelOrSkyPart):
     """One capture of the sky."""
 
     kind = "sky"
@@ -169,11 +169,11 @@ class SkyFile(_Part):
     captures: list[SkyPart]
 
 
-EXCLUDED_FILES = {PANELS_FILE: b'{\n "schema": "agalign-panels/', SKY_FILE: b'{\n "schema": "agalign-sky/'}
+PANEL_AND_SKY_FILES = {PANELS_FILE: b'{\n "schema": "agalign-panels/', SKY_FILE: b'{\n "schema": "agalign-sky/'}
 """How each of the two files starts, by name."""
 
 
-def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
+def read_panels_and_sky(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
     """Return the captures of panels and those of the sky of an earlier run.
 
     Raises SidecarError for a file that agalign did not write.
@@ -182,14 +182,16 @@ def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
     return ([] if panels is None else panels.panels), ([] if sky is None else sky.captures)
 
 
-def last_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
-    """Return the captures as `read_excluded`; none if a file cannot be read, which the commands that need it name."""
+def last_panels_and_sky(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
+    """Return the captures as `read_panels_and_sky`; none if a file cannot be read, which the commands that need it
+    name.
+    """
     with suppress(SidecarError):
-        return read_excluded(out)
+        return read_panels_and_sky(out)
     return [], []
 
 
-def exclusions(parts: Iterable[ExcludedPart]) -> list[str]:
+def exclusions(parts: Iterable[PanelOrSkyPart]) -> list[str]:
     """Return a line for each kind of captures that are not aligned: their number, and that of those with each cue."""
     lines, left_out = [], [part for part in parts if part.is_left_out]
     for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
