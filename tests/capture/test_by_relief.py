@@ -26,6 +26,7 @@ from agalign.capture.by_relief import (
     _Estimate,
     _fits_better,
     _std_px,
+    _with_field,
     by_relief,
 )
 from agalign.capture.by_rig import _parallax_by_rig, observed, rig_predictions
@@ -34,6 +35,7 @@ from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
+from agalign.fit.displacement_field import DisplacementEstimator, DisplacementResult
 from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded
@@ -44,7 +46,7 @@ from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix, PairScales
 from agalign.values.image import Raster
 from agalign.values.issues import CLOSE_WINDOWS, CLUSTER, NO_CONTRAST, REPEATS, RETRIEVAL, Issue, IssueKind
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 from agalign.values.residual import Residual, lengths_in_common_px
@@ -563,6 +565,19 @@ def test_an_observation_of_the_rig_is_no_alias(four_lenses: Rendered, monkeypatc
     monkeypatch.setattr(WarpedPair, "issues", (Issue(REPEATS, 12.0),))
     monkeypatch.setattr("agalign.capture.candidate.issues_of", lambda *_: (Issue(CLUSTER, 0.5, 0.1),))
     assert aligned_by_relief(four_lenses.refined({}), "auto", is_observation=True)[0] == {}
+
+
+def test_a_field_on_a_relief_is_verified_by_windows_that_it_is_not_fitted_to(
+    candidates: Sequence[RefinedBand], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    under = by_relief(candidates, "auto")[0][0]["Blue"]
+    assert under.issues == ()
+    field = DisplacementField(48.0, np.zeros((20, 20, 2)))
+    for shift_px, is_used in ((0.1, True), (3.0, False)):
+        held_out = residual_of(under.residual.centres_px, np.array([shift_px, 0.0]))
+        found = DisplacementResult(field, 1.0, 0.5, held_out)
+        monkeypatch.setattr(DisplacementEstimator, "refine", lambda *_, found=found: found)
+        assert (_with_field(under) is not under) == is_used
 
 
 def test_use(candidates: Sequence[RefinedBand]) -> None:
