@@ -77,11 +77,11 @@ def fitted_to_windows(band: BandCandidates, refined: RefinedBand | None = None) 
     return estimation._add_errors_of_relief(result)[band.pair.name]
 
 
-def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, noise_px: float = 0.12) -> Residual:
-    """Windows with shifts (n, 2) or one shift (2,), and equal noise."""
+def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, sigma: float = 20.0) -> Residual:
+    """Windows with shifts (n, 2) or one shift (2,), and peaks of equal height."""
     shifts_px = np.broadcast_to(np.asarray(shifts_px, float), np.shape(centres_px)).copy()
     columns_and_rows = [np.unique(along, return_inverse=True)[1] for along in np.reshape(centres_px, (-1, 2)).T]
-    return Residual(centres_px, shifts_px, np.full(len(centres_px), noise_px), np.stack(columns_and_rows, axis=1))
+    return Residual(centres_px, shifts_px, np.full(len(centres_px), sigma), np.stack(columns_and_rows, axis=1))
 
 
 def grid_px(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -98,14 +98,14 @@ class Remaining:
 
 
 def remaining(
-    capture: Capture, out: Path, settings: Settings, options: RunOptions, results: EarlierResults | None = None
+    capture: Capture, out: Path, settings: Settings, options: RunOptions, results: EarlierResults
 ) -> Remaining:
     """Return what remains to be done for a capture, given what the output folder has of it.
 
     The estimation is kept if all that it depends on is unchanged: options, version, contents of the input files. So are
     products, if their files exist too, and there are all those that the settings ask for.
     """
-    results, path = results or EarlierResults(), CapturePaths.of(capture, out).sidecar
+    path = CapturePaths.of(capture, out).sidecar
     try:
         earlier, change = results(path)
     except SidecarError:

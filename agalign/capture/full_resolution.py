@@ -76,14 +76,14 @@ def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
 
 
 def _tiles(residual: Residual, size_px: Size) -> list[Tile]:
-    """Return, for each cell of the reference (width, height), a tile around the window with the least noise in the
+    """Return, for each cell of the reference (width, height), a tile around the window with the highest peak in the
     reduced images.
     """
     # (columns, rows) of cells with one tile each: a few determine eight parameters, all of them fit into memory.
     min_cells, max_cells = (4, 3), (8, 6)
     counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, min_cells, max_cells, strict=True)]
     best: dict[tuple[int, int], Tile] = {}
-    for index in np.argsort(-residual.noise_px, kind="stable"):
+    for index in np.argsort(residual.peaks_sigma, kind="stable"):
         if math.isfinite(residual.shifts_px[index, 0]):
             (column, x0, width), (row, y0, height) = map(_side, residual.centres_px[index], size_px, counts)
             best[column, row] = Tile(x0, y0, width, height)

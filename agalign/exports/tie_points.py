@@ -69,8 +69,9 @@ def tie_points(alignment: Alignment, residual: Residual) -> NDArray[np.float64]:
     """
     measured = residual.is_measured
     at_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]
-    noise_px = residual.noise_px[measured]
-    weights = (np.median(noise_px) / noise_px) ** 2 if len(noise_px) else noise_px
+    # The standard error of a shift is proportional to 1 / (height of its correlation peak)^2.
+    sigma = residual.peaks_sigma[measured]
+    weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
     return np.column_stack([at_px, alignment.map(at_px + shifts_px), np.hypot(*shifts_px.T), weights])
 
 

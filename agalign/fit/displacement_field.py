@@ -23,7 +23,7 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.least_squares import cauchy_weights, mean_in_standard_errors, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, noise_px
 
 _FIELD_WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
@@ -100,8 +100,8 @@ class DisplacementEstimator:
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
         """Measure the windows; their weights are relative to one with a noise of _NOISE_PX."""
         residual = self.windows.residuals(warped(moving, mapping, self.size_px))
-        weights = np.minimum((_NOISE_PX / residual.noise_px[residual.is_measured]) ** 2, _MAX_WEIGHT)
-        return Shifts.of(residual)._replace(weights=weights)
+        peaks_sigma = residual.peaks_sigma[residual.is_measured]
+        return Shifts.of(residual)._replace(weights=np.minimum((_NOISE_PX / noise_px(peaks_sigma)) ** 2, _MAX_WEIGHT))
 
     def _held_out(
         self, moving: Raster, mapping: PixelMapping, field: DisplacementField, total: Shifts

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
-from agalign.fit.windows import Shifts, held_out_residual, relative_weights
+from agalign.fit.windows import Shifts, held_out_residual, peak_weights
 from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
@@ -122,7 +122,7 @@ def fit_windows(
 
     With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too; with the prior of its
     `baseline`, also that along which the band sees the relief of the mapping. Without lens shapes, the result is None
-    if fewer than 12 windows are measured. A window's weight is that by its noise times a Cauchy weight.
+    if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
     raw = Shifts.of(residual)
     min_windows = 12  # without a prior: 1.5 times the eight parameters of a homography
@@ -268,7 +268,7 @@ class WindowShifts:
         _, first, index = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         centres_px = np.concatenate([r.centres_px for r in residuals])[first]
         index_of_band = np.split(index.reshape(-1), np.cumsum([len(r.cells) for r in residuals])[:-1])
-        shifts, noise = np.full((len(first), len(residuals), 2), np.nan), np.full((len(first), len(residuals)), np.inf)
+        shifts, peaks = np.full((len(first), len(residuals), 2), np.nan), np.zeros((len(first), len(residuals)))
         for band, (residual, mapping) in enumerate(zip(residuals, mappings, strict=True)):
             measured = residual.is_measured
             if not measured.any():
@@ -279,9 +279,9 @@ class WindowShifts:
                 shifts[rows, band] += mapping.parallax.relief(xy)[:, None] * np.array(mapping.parallax.baseline)
             if with_lens_shapes and mapping.field is not None:
                 shifts[rows, band] += mapping.field(xy)
-            noise[rows, band] = residual.noise_px[measured]
+            peaks[rows, band] = residual.peaks_sigma[measured]
         points = mappings[0].without_parallax.undistorted(centres_px)
-        return cls(centres_px, points, shifts, relative_weights(noise))
+        return cls(centres_px, points, shifts, peak_weights(peaks))
 
     def __len__(self) -> int:
         return len(self.points_px)

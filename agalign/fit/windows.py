@@ -13,7 +13,6 @@ from agalign.pixels.structure import (
     Field,
     forward_transform,
     inverse_transform,
-    peak_noise_px,
     peak_positions,
     structure_field,
     whitened_cross_spectra,
@@ -99,7 +98,7 @@ class FixedWindows:
         """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
 
         A window is measured by the pixels that are valid in both images; the fewer these are, the lower is the peak,
-        and the larger the noise of the shift. Windows with too few are omitted.
+        and with it the weight of the shift. Windows with too few are omitted.
         """
         mask, structure = _inside(moving.valid), structure_field(moving)
         both = self.valid & mask
@@ -117,8 +116,8 @@ class FixedWindows:
                 fixed, other = (self._cut(valid, self.origins[rows[masked]]) for valid in (self.valid, mask))
                 cross[masked] = _relative_to_overlap(cross[masked], fixed, other)
             parts.append((rows, *_peaks(cross)))
-        rows, shifts_px, noise_px = map(np.concatenate, zip(*parts, strict=True))
-        return Residual(self.centres_px[rows], shifts_px, noise_px, self.cells[rows])
+        rows, shifts_px, sigma = map(np.concatenate, zip(*parts, strict=True))
+        return Residual(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
 
     def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
         """Return (n, side, side) the windows with these origins, a copy."""
@@ -173,7 +172,7 @@ def _relative_to_overlap(cross: Field, fixed: Mask, moving: Mask) -> Field:
 
 
 class Shifts(NamedTuple):
-    """The measured shifts of windows, (n, 2), with relative weights (n,) by their noise; their median is 1."""
+    """The measured shifts of windows, (n, 2), with relative weights (n,) by heights of peaks; their median is 1."""
 
     centres_px: Points
     shifts_px: Points
@@ -183,7 +182,7 @@ class Shifts(NamedTuple):
     def of(cls, residual: Residual) -> "Shifts":
         """Select the measured shifts of a residual."""
         measured = residual.is_measured
-        weights = relative_weights(residual.noise_px[measured])
+        weights = peak_weights(residual.peaks_sigma[measured])
         return cls(residual.centres_px[measured], residual.shifts_px[measured], weights)
 
     @classmethod
@@ -199,15 +198,14 @@ class Shifts(NamedTuple):
         return np.asarray(np.linalg.norm(self.shifts_px - predicted_px, axis=1))
 
 
-def relative_weights(noise_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of shifts, in the shape of their noise: the inverse of its square; 0 where it is infinite.
+def peak_weights(peaks_sigma: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the relative weights of shifts from the heights (n,) of their correlation peaks; 0 for a height of 0.
 
-    The weight of the median noise is 1. Weights are limited, so that the parts with most texture do not determine the
-    geometry of the others.
+    The errors of shifts are inversely proportional to the squared peaks. The weight of a median peak is 1; it is
+    limited, so that the parts with most texture do not determine the geometry of the others.
     """
-    is_known, max_weight = np.isfinite(noise_px), 4.0
-    median_px = np.median(noise_px[is_known]) if is_known.any() else 1.0
-    return np.minimum((median_px / noise_px) ** 2, max_weight)
+    positive, max_weight = peaks_sigma[peaks_sigma > 0], 4.0
+    return np.minimum((peaks_sigma / np.median(positive)) ** 4, max_weight) if positive.size else peaks_sigma
 
 
 def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
@@ -252,7 +250,7 @@ def _starts(length: int, side: int, step: int | None) -> list[int]:
 
 
 def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the shifts (n, 2) of cross spectra and the RMS noise (n,) of their length; NaN without a clear peak."""
+    """Return the shifts (n, 2) px of cross spectra, NaN without a clear peak, and the peak heights (n,) in sigma."""
     count, height, width = cross.shape
     surfaces = inverse_transform(cross).real.reshape(count, height * width)
     highest = surfaces.argmax(axis=1)
@@ -262,11 +260,8 @@ def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     row, column = np.divmod(highest, width)
     # Shifts are circular: beyond half a window they are negative.
     coarse = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
-    shifts_px, noise_px = np.full((count, 2), np.nan), np.full(count, np.nan)
+    shifts_px = np.full((count, 2), np.nan)
     min_peak_sigma = 7.0  # lower peaks may be chance
     is_clear = sigma >= min_peak_sigma
     shifts_px[is_clear] = peak_positions(cross[is_clear], coarse[is_clear].astype(np.float64))
-    noise_px[is_clear] = peak_noise_px(cross[is_clear], shifts_px[is_clear])
-    is_found = np.isfinite(noise_px)
-    shifts_px[~is_found] = noise_px[~is_found] = np.nan
-    return shifts_px, noise_px
+    return shifts_px, sigma.astype(np.float64)

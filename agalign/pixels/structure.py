@@ -17,10 +17,6 @@ from agalign.values.image import FloatImage, Raster
 
 Field = NDArray[np.complex64]
 
-_CORRELATED_FREQUENCIES = 3.9
-"""Factor on the noise of independent frequencies: 1.94 by the Hann windows of two images, and 2 by texture that fills a
-window unevenly (1.7 to 2.4 in sharp, noisy and blurred images, windows of 48 and 112 px)."""
-
 
 def structure_field(raster: Raster) -> Field:
     """Return z of a raster of one channel, (height, width) complex64, |z| <= 1; 0 at and next to invalid pixels."""
@@ -152,36 +148,6 @@ def peak_positions(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.flo
         patches = (rows @ _fourier_basis(x, width).transpose(0, 2, 1)).real
         result += step * paraboloid_peaks(patches.astype(np.float64))
     return result
-
-
-def peak_noise_px(cross: Field, peaks_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the RMS noise (n,) of the length of the subpixel peak positions `peaks_px` (n, 2) of the surfaces of cross
-    spectra (n, height, width); infinite for a surface without a maximum there.
-
-    With the phases of the peak removed, the real part of a spectrum C is what both windows have in common, and its
-    imaginary part is noise. At the peak, the gradient of the surface is the sum of w Im C over the frequencies w =
-    (x, y), and its second derivatives H are that of w w^T Re C. The covariance of the position is inv(H) S inv(H),
-    where the covariance S of the gradient is the sum of w w^T (Im C)^2 (White 1980): no model of the noise is needed.
-    """
-    height, width = cross.shape[-2:]
-    x, y = (
-        np.exp(2j * np.pi * at[:, None] * np.fft.fftfreq(length)).astype(np.complex64)
-        for at, length in zip(peaks_px.T, (width, height), strict=True)
-    )
-    aligned = cross * y[:, :, None] * x[:, None, :]
-    hessian, of_gradient = (_second_moments(part) for part in (aligned.real, np.square(aligned.imag)))
-    has_maximum = (hessian[:, 0, 0] > 0) & (np.linalg.det(hessian) > 0)
-    inverse = np.linalg.inv(np.where(has_maximum[:, None, None], hessian, np.eye(2)))
-    variance_px2 = np.einsum("nij,njk,nki->n", inverse, of_gradient, inverse)
-    return np.where(has_maximum, _CORRELATED_FREQUENCIES * np.sqrt(variance_px2), np.inf)
-
-
-def _second_moments(spectra: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return (n, 2, 2) the sums of w w^T over the frequencies w = (x, y), weighted by spectra (n, height, width)."""
-    wy, wx = (2 * np.pi * np.fft.fftfreq(length) for length in spectra.shape[-2:])
-    xx, yy = spectra.sum(axis=1) @ np.square(wx), spectra.sum(axis=2) @ np.square(wy)
-    xy = (spectra @ wx.astype(np.float32)) @ wy
-    return np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
 
 
 def _fourier_basis(positions_px: NDArray[np.float64], length: int) -> Field:

@@ -1,4 +1,4 @@
-"""The sidecar of a capture, a JSON file next to its aligned stack: schema `agalign/4`.
+"""The sidecar of a capture, a JSON file next to its aligned stack: schema `agalign/3`.
 
 It is the whole result of the estimation, together with the raster of the parallax of a capture that has one: rasters
 are rendered from it and the files of the capture. Its parts are the records of the program themselves (`values`), or
@@ -63,7 +63,7 @@ from agalign.values.radiometry import RadiometricError
 from agalign.values.remedies import MISSING_BAND
 from agalign.values.residual import Residual, Similarity
 
-SCHEMA = "agalign/4"
+SCHEMA = "agalign/3"
 PointPx = tuple[Number, Number]
 SampledPx = Annotated[NDArray[np.float64], Array((None, 2), 3)]
 """Their rounding is small compared with the error of interpolation between them."""
@@ -555,7 +555,7 @@ class Sidecar(_Part):
         json_schema_extra={"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:{SCHEMA}"}
     )
 
-    schema_: Annotated[Literal["agalign/4"], Field(alias="schema")] = "agalign/4"
+    schema_: Annotated[Literal["agalign/3"], Field(alias="schema")] = "agalign/3"
     """Version of the format."""
     agalign: Name
     """Version of the program."""

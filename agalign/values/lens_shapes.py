@@ -21,7 +21,7 @@ cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tag
 at 800 px from the centre."""
 CALIBRATED = 0.4
 """Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
-VARIANCE_FACTOR = 12.0
+_VARIANCE_FACTOR = 12.0
 """Factor on the variance of shifts for lens shapes: these extrapolate errors by relief, which neighbouring windows have
 in common. In an adjustment, the parallax of each window takes the relief, and there is no factor. Assumed."""
 
@@ -63,5 +63,5 @@ def shift_variance_px2(scale_px: float | Array, *, with_shapes: bool = False) ->
     fitted.
     """
     axis_share = 1 / 3  # of the squared scale of lengths; normally distributed: 1 / 3.05
-    factor = VARIANCE_FACTOR if with_shapes else 1.0
+    factor = _VARIANCE_FACTOR if with_shapes else 1.0
     return factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2

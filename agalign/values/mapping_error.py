@@ -16,13 +16,12 @@ from scipy.spatial import cKDTree
 from agalign.values import geometry
 from agalign.values.geometry import PairScales, Points
 from agalign.values.image import FloatImage, Tile
-from agalign.values.least_squares import MIN_SHIFT_SCALE_PX
-from agalign.values.lens_shapes import VARIANCE_FACTOR, lens_shapes, variance_px2
+from agalign.values.lens_shapes import lens_shapes, shift_variance_px2, variance_px2
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
 from agalign.values.resampling import between_nodes, nodes_along
-from agalign.values.residual import Residual, square_weights
+from agalign.values.residual import Residual, noise_px, square_weights
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
@@ -203,10 +202,7 @@ class MappingError:
         damping = 1e-9 * np.trace(flat_corners.T @ flat_corners) * np.eye(8)
         followed = np.linalg.solve(flat_corners.T @ flat_corners + damping, flat_corners.T @ flat_lenses)
         remaining = flat_lenses - flat_corners @ followed
-        # Windows have their errors beyond noise in common, but not their noise; half of a square is along each axis.
-        common_px2, noise_px2 = self._measured.std_px**2, self._measured.median_noise_px**2
-        variance_px2 = (VARIANCE_FACTOR * common_px2 + noise_px2) / 2 + MIN_SHIFT_SCALE_PX**2
-        information = remaining.T @ remaining / variance_px2
+        information = remaining.T @ remaining / shift_variance_px2(self._measured.std_px, with_shapes=True)
         of_lenses = np.linalg.inv(np.diag(self.lens_std_px**-2.0) + information)
         result = np.zeros((12, 12))
         result[:8, :8] = self.covariance_px2[:8, :8] + followed @ of_lenses @ followed.T
@@ -225,14 +221,14 @@ class MappingError:
         measured = self._measured
         if measured is None:
             return np.zeros(len(points_px))
-        noise_px2, precision = np.square(measured.noise_px), square_weights(measured)
+        noise_px2, precision = np.square(noise_px(measured.peaks_sigma)), square_weights(measured)
         squares = np.square(measured.shifts_px).sum(axis=1)
         count = min(8, len(squares))  # nearest windows
         distance, index = (values.reshape(-1, count) for values in self._tree.query(points_px, k=count))
         weight = np.exp(-0.5 * (distance / self._spacing_px) ** 2) * precision[index] + 1e-12
         # The median square of a shift with two normally distributed components is log(2) times its mean square.
         all_px2, total = measured.std_px**2, weight.sum(axis=1)
-        of_all_px2 = math.log(2) * (all_px2 + measured.median_noise_px**2)
+        of_all_px2 = math.log(2) * (all_px2 + np.quantile(noise_px2, 0.5, weights=precision, method="inverted_cdf"))
         near_squares = np.column_stack([squares[index], np.full(len(index), of_all_px2)])
         order = np.argsort(near_squares, axis=1)
         lacking = np.maximum(2.001 * weight.max(axis=1) - total, 0.0)  # a little more, so that it decides

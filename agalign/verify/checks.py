@@ -33,7 +33,7 @@ from agalign.values.issues import (
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, noise_px
 
 MAX_UNEXPECTED_PX = 3.0
 """Distance from the prediction by the rig, px of the moving file, that is always accepted, as relief may cause it."""
@@ -130,8 +130,8 @@ def is_misaligned(residual: Residual, pixel_px: float) -> NDArray[np.bool_]:
     `pixel_px` is the size of a pixel of the reference's file on this grid.
     """
     lengths_px = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1)
-    noise_px = np.nan_to_num(residual.noise_px)
-    return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise_px))
+    noise = noise_px(np.maximum(residual.peaks_sigma, 1e-6))
+    return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
 
 
 def _error_issues(error: MappingError, residual: Residual, common_px: Points, pixel_px: float) -> Iterator[Issue]:

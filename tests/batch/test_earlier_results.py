@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.batch.earlier_results import Remaining, remaining
+from agalign.batch.earlier_results import EarlierResults, Remaining, remaining
 from agalign.batch.output_files import is_same
 from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
 from agalign.batch.workers import RunTasks, open_workers
@@ -169,7 +169,7 @@ def test_a_result_of_another_schema_is_refused_before_anything_is_written(flight
 
 def remaining_of(flight: Path, sidecar: Path, out: Path) -> Remaining:
     (capture,) = (c for c in agalign.discover(flight).captures if c.name == sidecar.stem)
-    return remaining(capture, out, SEEDS, agalign.RunOptions())
+    return remaining(capture, out, SEEDS, agalign.RunOptions(), EarlierResults())
 
 
 def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def with_field(run: Run) -> dict[str, Alignment]:
         field = DisplacementField(48.0, rng.normal(0, 1, (6, 7, 2)).round(POSITION_DECIMALS))
         mapping = replace(alignment.mapping, parallax=None, field=field)
         centres_px = rng.uniform((0, 0), SIZE, (30, 2))
-        residual = residual_of(centres_px, rng.normal(0, 0.1, (30, 2)), noise_px=0.1712345)
+        residual = residual_of(centres_px, rng.normal(0, 0.1, (30, 2)), sigma=17.123456)
         joint = joint_result(std_px=0.0512345678, covariance=np.diag(rng.uniform(0, 0.01, 8)))
         error = MappingError(
             alignment.size_px,

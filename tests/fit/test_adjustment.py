@@ -154,15 +154,13 @@ def test_parallax_is_the_projection_onto_the_baselines() -> None:
 def test_windows_are_matched_by_their_cells() -> None:
     at = np.array([[10.0, 20.0], [30.0, 20.0], [50.0, 20.0]])
     one = residual_of(at, np.array([[1.0, 0], [2, 0], [np.nan, np.nan]]))
-    other = residual_of(at[[2, 1, 0]], np.array([[3.0, 0], [0, 0], [4, 0]]), noise_px=0.12 / 9).where(
-        np.array([1, 0, 1]) > 0
-    )
+    other = residual_of(at[[2, 1, 0]], np.array([[3.0, 0], [0, 0], [4, 0]]), sigma=60.0).where(np.array([1, 0, 1]) > 0)
     plain = PixelMapping(np.eye(3))
     windows = WindowShifts.of([one, other], [plain, plain])
     np.testing.assert_array_equal(windows.centres_px, at)
     np.testing.assert_array_equal(windows.shifts_px[..., 0], [[1, 4], [2, np.nan], [np.nan, 3]])
-    # Weights are the inverse squares of the noise up to a limit; windows without a measurement have weight 0.
-    np.testing.assert_allclose(windows.weights, [[0.309, 4], [0.309, 0], [0, 4]], rtol=0.01)
+    # Weights grow with the peak height up to a limit; windows without a measurement have weight 0.
+    np.testing.assert_allclose(windows.weights, [[0.0625, 4], [0.0625, 0], [0, 4]])
     assert WindowShifts.of([residual_of(at, (np.nan, np.nan))], [plain]).weights.tolist() == [[0.0]] * 3
     assert len(WindowShifts.of([residual_of(at[:0], at[:0])], [plain])) == 0
 

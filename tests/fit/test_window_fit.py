@@ -120,12 +120,12 @@ def test_wrong_peaks_do_not_bias_the_fit(lens: bool) -> None:
     assert np.trace(fit.covariance_px2) > np.trace(fitted(clean, lens).covariance_px2)
 
 
-def test_noisy_windows_have_little_weight() -> None:
+def test_windows_with_low_peaks_have_little_weight() -> None:
     centres = geometry.lattice(*SIZE, 60, 40)
-    shifts, noise_px = np.zeros((2400, 2)), np.full(2400, 0.1)
-    shifts[::2], noise_px[::2] = (0.1, 0.0), 0.4
-    # Four times the noise, a sixteenth of the weight.
-    fit = fitted(replace(residual_of(centres, shifts), noise_px=noise_px))
+    shifts, peaks = np.zeros((2400, 2)), np.full(2400, 20.0)
+    shifts[::2], peaks[::2] = (0.1, 0.0), 10.0
+    # Half the height, a sixteenth of the weight.
+    fit = fitted(replace(residual_of(centres, shifts), peaks_sigma=peaks))
     assert fit.corners_px[0::2].mean() == pytest.approx(0.1 / 17, abs=0.002)
 
 

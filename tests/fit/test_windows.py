@@ -61,21 +61,3 @@ def test_windows_share_no_pixels_and_cover_the_image(size_px: tuple[int, int]) -
         counts[y : y + windows.side, x : x + windows.side] += 1
     assert counts.max() == 1
     assert counts.mean() > 0.75
-
-
-@pytest.mark.parametrize("side_px", [48, 112])
-@pytest.mark.parametrize(("blur_px", "noise_share"), [(0.0, 0.3), (0.0, 1.0), (3.0, 0.02)])
-def test_the_noise_is_the_scatter_of_the_shifts(side_px: int, blur_px: float, noise_share: float) -> None:
-    """In small and large windows, sharp and blurred images, which have wide peaks."""
-    rng, image = np.random.default_rng(0), textured_image(*SIZE, seed=2)
-    seen = cv2.GaussianBlur(image, (0, 0), blur_px) if blur_px else image
-    fixed, moving = (
-        Raster((x + rng.normal(0, noise_share * image.std(), x.shape)).astype(np.float32), np.ones(x.shape, bool))
-        for x in (seen, -seen)
-    )
-    residual = FixedWindows(fixed.valid, structure_field(fixed), side_px).residuals(moving)
-    measured = residual.is_measured
-    # The median of the lengths of normally distributed shifts is sqrt(log 2) times their RMS.
-    ratio = np.median(residual.lengths_px / residual.noise_px[measured]) / np.sqrt(np.log(2))
-    assert measured.sum() > 15
-    assert 0.7 < ratio < 1.3

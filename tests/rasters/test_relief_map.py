@@ -300,7 +300,7 @@ def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
         assert getattr(result, name) == getattr(alignment, name)
     assert (result.seed.kind, result.seed.peak_sigma, result.seed.runner_up_sigma) == ("rig", 30.0, 5.0)
     np.testing.assert_array_equal(result.seed.fixed_to_moving, H)
-    for name in ("centres_px", "shifts_px", "median_px", "p95_px", "coverage", "noise_px", "cells"):
+    for name in ("centres_px", "shifts_px", "median_px", "p95_px", "coverage", "peaks_sigma", "cells"):
         np.testing.assert_array_equal(getattr(result.residual, name), getattr(residual, name))
 
 

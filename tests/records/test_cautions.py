@@ -295,7 +295,7 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
     centres = np.stack(np.meshgrid(np.arange(40, 1280, 80.0), np.arange(40, 960, 80.0)), axis=-1).reshape(-1, 2)
     shifts = np.where(centres[:, :1] < 160, 3.0, 0.0) * np.ones(2)
     cells = (centres // 80).astype(int)
-    residual = Residual(centres, shifts, np.full(len(centres), 0.02), cells)
+    residual = Residual(centres, shifts, np.full(len(centres), 50.0), cells)
     seed, error = Seed("rig", np.eye(3), 9.0), MappingError(size_px, residual=residual)
     alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), seed, residual=residual, error=error)
     reference, grid = Band("Green", Path("a.tif"), 1, *size_px, "uint16"), OutputGrid(0, 0, *size_px)

@@ -85,7 +85,7 @@ def test_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "sub" / "IMG_1.json"
     write_sidecar(path, example())
     assert read_sidecar(path).model_copy(update={"checksum": None}) == example()
-    assert read_json(path)["schema"] == "agalign/4"
+    assert read_json(path)["schema"] == "agalign/3"
     assert not list(path.parent.glob(".*"))
     with pytest.raises(OutputError, match=r"IMG_1\.json"):
         write_sidecar(path / "IMG_1.json", example())
@@ -106,8 +106,8 @@ def test_the_schema_accepts_and_refuses() -> None:
         ("{", "JSON"),
         ("[]", "schema"),
         ('{"schema": "agalign/9"}', "agalign/9"),
-        ('{"schema": "agalign/4"}', "agalign: "),
-        ('{"schema": "agalign/1"}', "schema is 'agalign/1', not 'agalign/4'; run again into a new folder"),
+        ('{"schema": "agalign/3"}', "agalign: "),
+        ('{"schema": "agalign/1"}', "schema is 'agalign/1', not 'agalign/3'; run again into a new folder"),
         ('{"schema": "agalign/2", "agalign": "0.1", "bands": [3]}', "schema is 'agalign/2' of agalign 0.1, not"),
     ],
 )

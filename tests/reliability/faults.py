@@ -600,7 +600,7 @@ _ENDLESS_LENS = (
 )
 _LINE = np.random.default_rng(0).integers(0, 60000, (1, 100000), np.uint16)
 _MAKER, _NODATA = (271, 2, 0, "Maker", True), [(42113, 2, 2, "0", True)]
-_DEEP = '{"schema": "agalign/4", "bands": ' + "[" * 200_000
+_DEEP = '{"schema": "agalign/3", "bands": ' + "[" * 200_000
 _POSSIBLE_NAMES = "a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200
 _IN_TIME = "-j", "2", "--timeout", "100"
 _FILES_ELSEWHERE = '"band_files": [{"file": "../a", "bytes": 1}]'

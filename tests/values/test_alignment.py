@@ -60,21 +60,21 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error_px", "noise_px", "std_px"),
+    ("error_px", "noise_px", "sigma", "std_px"),
     [
-        (1.0, 0.0, 1.0),  # misalignment
-        (0.8, 0.6, 0.8),  # noise explains a part
-        (0.0, 0.6, 0.3),  # or all, but it is only known to a factor of two
+        (1.0, 0.0, 40.0, 1.0),  # misalignment
+        (0.8, 0.6, 48**0.5 / 0.6**0.5, 0.8),  # low peaks explain a part
+        (0.0, 0.6, 48**0.5 / 0.6**0.5, 0.3),  # or all, but the noise is only known to a factor of two
     ],
 )
 @pytest.mark.parametrize("wrong", [0.0, 0.15])
-def test_windows_show_the_error_beyond_their_noise(
-    error_px: float, noise_px: float, std_px: float, wrong: float
+def test_windows_show_the_error_beyond_the_noise_of_their_peaks(
+    error_px: float, noise_px: float, sigma: float, std_px: float, wrong: float
 ) -> None:
     """Whether or not some of them are wrong peaks."""
     rng = np.random.default_rng(0)
     shifts_px = rng.normal(0, np.hypot(error_px, noise_px) / 2**0.5, (4000, 2))
     shifts_px[: int(4000 * wrong)] = rng.uniform(-20, 20, (int(4000 * wrong), 2))
-    residual = residual_of(geometry.lattice(640, 480, 80, 50), shifts_px, noise_px)
+    residual = residual_of(geometry.lattice(640, 480, 80, 50), shifts_px, sigma)
     assert 0.9 * std_px < residual.std_px < (2.0 if wrong else 1.1) * std_px
     assert residual.where(np.zeros(4000, bool)).std_px == np.inf

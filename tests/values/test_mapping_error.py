@@ -15,7 +15,7 @@ from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.moved_area import MovedArea
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, noise_px
 
 from ..builders import grid_px, residual_of, texture
 
@@ -93,7 +93,7 @@ def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
     of_alone[-5:] = 12.0, 0.0  # a column of such shifts is one
     assert expected_px(error_of([0.01] * 4, residual_of(alone_px, of_alone)), *alone_px[-3]) > 1.0
     noise = np.random.default_rng(0).normal(0, 0.98 / np.sqrt(2), centres_px.shape)
-    known = error_of([0.01] * 4, residual_of(centres_px, noise, noise_px=0.98))
+    known = error_of([0.01] * 4, residual_of(centres_px, noise, sigma=7.0))
     assert np.median(known.error_px(centres_px)) < 0.6
 
 
@@ -177,11 +177,11 @@ def test_the_error_on_a_grid_is_that_of_its_pixels(parallax: Parallax | None) ->
         np.testing.assert_allclose(on_grid.on_tile(tile).ravel(), error.error_px(to_reference(at)), rtol=0.02)
 
 
-@pytest.mark.parametrize("noise_px", [0.0, 0.5])
-def test_the_error_between_images_is_that_between_files(noise_px: float) -> None:
-    """In px of the file, which are smaller; the noise of shifts too."""
-    scales, of_windows = PairScales(HALF, HALF), np.full(16, noise_px)
-    lens_px, windows = lens_std_px(SIZE, calibrated=False), replace(columns(4), noise_px=of_windows)
+@pytest.mark.parametrize("sigma", [1000.0, 10.0])
+def test_the_error_between_images_is_that_between_files(sigma: float) -> None:
+    """In px of the file, which are smaller; the noise of peaks too."""
+    scales, peaks_sigma = PairScales(HALF, HALF), np.full(16, sigma)
+    lens_px, windows = lens_std_px(SIZE, calibrated=False), replace(columns(4), peaks_sigma=peaks_sigma)
     covariance_px2 = np.diag(np.linspace(0.01, 0.1, 8))
     between_images = MappingError(SIZE, covariance_px2, windows, 0.2, lens_px, 0.3, 0.4, with_steps())
     parallax = with_steps().rescaled(PixelScale(2.0, 2.0))
@@ -195,10 +195,11 @@ def test_windows_with_much_noise_say_little_of_the_error() -> None:
     """Their noise is known only to a factor, here to 1.4. They overlap, as under a relief."""
     rng = np.random.default_rng(0)
     centres_px = geometry.lattice(449, 289, 15, 10)
-    noise_px = np.where(np.arange(150) % 2 == 0, 0.05, 0.85)
-    shifts_px = rng.normal(size=(150, 2)) * np.sqrt((0.1**2 + (1.4 * noise_px) ** 2) / 2)[:, None]
-    residual = replace(residual_of(centres_px, shifts_px), noise_px=noise_px)
-    assert 0.08 < residual.where(noise_px < 0.1).std_px <= residual.std_px < 0.2
+    peaks_sigma = np.where(np.arange(150) % 2 == 0, 30.0, 7.5)
+    noise = 1.4 * noise_px(peaks_sigma)
+    shifts_px = rng.normal(size=(150, 2)) * np.sqrt((0.1**2 + noise**2) / 2)[:, None]
+    residual = replace(residual_of(centres_px, shifts_px), peaks_sigma=peaks_sigma)
+    assert 0.08 < residual.where(peaks_sigma > 10).std_px <= residual.std_px < 0.2
     error = MappingError((449, 289), np.zeros((8, 8)), residual).error_px(centres_px)
     assert np.sqrt(np.square(error).mean()) < 0.25
 
@@ -207,7 +208,7 @@ def test_windows_of_several_captures_have_the_weights_of_one() -> None:
     """Their centres are the same, and the tolerated noise is relative to their spacing."""
     rng = np.random.default_rng(1)
     centres_px = geometry.lattice(1680, 1120, 15, 10)
-    one = replace(residual_of(centres_px, rng.normal(size=(150, 2))), noise_px=rng.uniform(0.05, 1.0, 150))
+    one = replace(residual_of(centres_px, rng.normal(size=(150, 2))), peaks_sigma=rng.uniform(7, 30, 150))
     three = Residual.joined([one] * 3)
     assert three.spacing_px == one.spacing_px > 100
     assert three.std_px == pytest.approx(one.std_px)

@@ -192,10 +192,10 @@ def windows(off: np.ndarray) -> Residual:
 
 
 def test_a_noisy_window_is_misaligned_only_beyond_its_noise() -> None:
-    """With a noise of 0.98 px, 2.1 px are no misalignment, 2.3 px are."""
+    """A peak of 7 sigma has a noise of 0.98 px: 2 px are then no misalignment, 2.3 px are."""
     for shift_px, expected in ((2.1, []), (2.3, ["close_windows"])):
         noisy = shifted(11, shift_px)
-        noisy = replace(noisy, noise_px=np.full(100, 0.98))
+        noisy = replace(noisy, peaks_sigma=np.full(100, 7.0))
         assert [code for code in codes(residual=noisy) if code != "inaccurate"] == expected
 
 
