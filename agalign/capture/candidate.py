@@ -309,7 +309,7 @@ class BandCandidates:
 
     @property
     def joint(self) -> JointResult | None:
-        """The last result of the optimisation."""
+        """The result of the last candidate: of the optimisation, of windows alone, or of tiles of the files."""
         return self.candidates[-1].joint if self.candidates else None
 
     @property

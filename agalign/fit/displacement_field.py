@@ -1,6 +1,6 @@
 """Smooth displacement fields in addition to a homography, fitted to the residual shifts of windows.
 
-A field is accepted if it reduces the residuals of windows that were left out of the fit and does not fold the image.
+A field is accepted if the p95 of windows that were left out of the fit hardly grows, and the image does not fold.
 """
 
 import math
@@ -50,7 +50,7 @@ _FOLDS = 4
 
 @dataclass(frozen=True)
 class DisplacementResult:
-    """A displacement field, and its effect on the residual of held-out windows; no field if it does not reduce it."""
+    """A displacement field, and its effect on the residual of held-out windows; no field if it increases that."""
 
     field: DisplacementField | None
     before_p95_px: float

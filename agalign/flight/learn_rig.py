@@ -150,7 +150,8 @@ class _Table:
                 squares_px2[is_left_out, j] = (error_px**2).sum(axis=(1, 2))
         counts = (self.weights > 0).sum(axis=0)
         mean_px2 = (squares_px2 * (self.weights > 0)).sum(axis=0) / counts
-        # The final rig has one capture more than a fit of a fold: the error variance is proportional to 1 + 1 / n.
+        # The final rig has more captures than a fit without a fold, at least one: the error variance is proportional to
+        # 1 + 1 / n.
         of_final_px2 = mean_px2 * (1 + 1 / counts) / (1 + 1 / np.maximum(counts - 1, 1))
         return np.asarray(np.sqrt(rig.expected_square(of_final_px2, counts)))
 

@@ -162,7 +162,7 @@ def mapping_weight(std_px: ArrayLike, model_error_px: ArrayLike = 0.0) -> Array:
 
 def expected_square(mean_square: ArrayLike, count: ArrayLike) -> Array:
     """Return the mean squares (n,) to expect of further errors from those of `count` (n,) ones: few may be small by
-    chance. A single one, of which nothing is to be expected, has the factor of two.
+    chance. A single one, of which nothing is to be expected, has the factor of two errors, which is 3.
     """
     number = np.maximum(np.asarray(count, np.float64), 2)
     return np.asarray(np.asarray(mean_square) * (number + 1) / (number - 1))

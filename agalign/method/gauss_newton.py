@@ -23,7 +23,8 @@ _CELL_PX = 48
 _MAX_CORNER_STD_PX = 0.5
 """Above this standard error of the least certain corner, px of the level, a simpler family has a smaller error."""
 _MAX_STEP_PX = 4.0
-"""Maximum step, px of the level: the descriptors are approximately linear in a shift of up to this length."""
+"""Maximum step before its extrapolation, px of the level: the descriptors are approximately linear in a shift of up to
+this length."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Step:
     change: Tensor
     """(3, 3) homography on fixed pixels, float64."""
     length_px: float
-    """Largest displacement of a corner, px of the level."""
+    """Largest displacement of a corner before the step is cut, px of the level."""
     corner_std_xy_px: tuple[tuple[float, float], ...]
     """Standard errors (x, y) of the mapped corners, clockwise from the top left, px of the level."""
     family: ModelFamily

@@ -29,8 +29,8 @@ TEST_KEYPOINTS = 256
 CONVERGED_PX = 0.5
 """While learning, psi has converged if a step displaces no corner by more than this, px of the level."""
 PATCHES, FLIGHT_PATCHES = 400, 256
-"""Patches in a Gauss-Newton step at full resolution: for a single capture, and for a capture of a flight, where the
-rig contributes to the estimate. Half as many are used while the steps are longer than CONVERGED_PX."""
+"""Patches in a Gauss-Newton step at full resolution: for a single capture, and for a capture of a flight, where
+other captures contribute to network or rig. Half as many are used while the steps are longer than CONVERGED_PX."""
 _FINAL_OCTAVES = 0.3
 """Range of log2 of their scales: small patches localise better."""
 _FINAL_CONVERGED_PX = 0.06

@@ -82,9 +82,12 @@ def least_squares(
 
 
 def shift_scale_px(lengths_px: Array) -> float:
-    """Return the robust standard deviation of residual shifts with these lengths (n,), at least MIN_SHIFT_SCALE_PX."""
+    """Return a robust scale of residual shifts with these lengths (n,), at least MIN_SHIFT_SCALE_PX.
+
+    Of normally distributed shifts, it is 1.23 times the RMS length, 1.75 times the standard deviation along an axis.
+    """
     median_px = float(np.median(lengths_px)) if len(lengths_px) else 0.0
-    mad_to_std = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+    mad_to_std = 1.4826  # of signed residuals; lengths of two components have a larger median
     return max(mad_to_std * median_px, MIN_SHIFT_SCALE_PX)
 
 
