@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 from agalign.host.text import counted
-from agalign.records.run_record import ProblemKind
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar
 
@@ -76,14 +75,7 @@ class CaptureReport:
     @property
     def problems(self) -> tuple[str, ...]:
         """Errors, except bands that are not aligned; those are in the sidecar."""
-        return tuple(self.kinds_of_problems)
-
-    @property
-    def kinds_of_problems(self) -> dict[str, ProblemKind]:
-        """The kind of each problem in the record of the run, by its text."""
-        kinds = dict[str, ProblemKind]({} if self.error is None else {self.error: "failed"})
-        kinds |= dict.fromkeys(self.failed_products, "not_written")
-        return kinds | ({self.why_kept: "kept"} if self.why_kept else {})
+        return tuple(dict.fromkeys(filter(None, (self.error, *self.failed_products, self.why_kept))))
 
     @property
     def summary(self) -> str:

@@ -39,7 +39,7 @@ from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.product import CapturePaths, RenderOptions
 from agalign.records.listed_files import states_of
 from agalign.records.panels_and_sky import last_panels_and_sky
-from agalign.records.run_record import Finished, RunPart, RunState, begun, input_name, last_record
+from agalign.records.run_record import Finished, ProblemKind, RunPart, RunState, begun, input_name, last_record
 from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages, pages_exist, write_pages
 from agalign.report.pair_totals import PairTotals
@@ -120,8 +120,9 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
         try:
             for report in run.reports(selection, record):
                 finished[report.label] = Finished(report.state, seconds=report.seconds)
-                for text, kind in report.kinds_of_problems.items():
-                    record.add_problem(report.label, text, kind)
+                for text in report.problems:
+                    kinds: dict[str | None, ProblemKind] = {report.error: "failed", report.why_kept: "kept"}
+                    record.add_problem(report.label, text, kinds.get(text, "not_written"))
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:

@@ -36,7 +36,7 @@ from agalign.report.pair_totals import PairTotals
 
 from ..conftest import raising, seeded, write_capture
 from ..program import agalign_here
-from ..records.test_cautions import panel
+from ..records.test_cautions import panel, reflectance_by
 from ..records.test_sidecar import NIR, example
 
 GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
@@ -321,7 +321,7 @@ def record_of(**states: str) -> RunPart:
 def test_the_age_of_a_panel_is_printed_and_warned_of(
     radiometry: str, age_s: float | None, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    output = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
+    output = reflectance_by(radiometry.removeprefix("reflectance by "), radiometry=radiometry)
     totals = RunTotals(True, {"IMG_1": 2}, record_of(IMG_1="done"))
     few_saturated = NIR | {"reason": None, "saturated": 0.001}
     sidecar = example(output=output | {"panel_age_s": age_s}, bands=[few_saturated])
@@ -371,8 +371,7 @@ def test_the_exit_code_is_that_of_the_captures_of_the_run(of_run: str, code: int
     totals = RunTotals(True, {of_run: 1}, record_of(**{of_run: "done"}), pairs=pairs)
     aligned = NIR | {"status": "aligned", "reason": None}
     totals.pairs.add("IMG_1", example(bands=[aligned]))
-    by_sensor = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": "reflectance by light sensor"}
-    totals.pairs.add("IMG_2", example(bands=[aligned], output=by_sensor))
+    totals.pairs.add("IMG_2", example(bands=[aligned], output=reflectance_by("light sensor")))
     assert conclude(totals, tmp_path, Terminal()) == code
 
 
