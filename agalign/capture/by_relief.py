@@ -263,8 +263,9 @@ def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
         # Planes of different depth resemble a repetition in images without relief.
         verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.relief_check_windows, held_out)
         candidate = band.candidate(mapping, verified)
-        # A window across a depth edge contains the parallax of neither side.
-        issues = [issue for issue in (*candidate.issues, *verified.issues) if issue.kind not in BY_PARALLAX]
+        # A window across a depth edge contains the parallax of neither side. Pixels are not checked where it causes
+        # other issues: bands of a bench with plants would be no observations, and it would have no rig.
+        issues = [issue for issue in candidate.issues if issue.kind not in BY_PARALLAX]
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
             result[band.name] = replace(candidate, given_issues=())
