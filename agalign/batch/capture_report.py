@@ -35,7 +35,7 @@ class CaptureReport:
     """Folder and number of the capture, as 0000SET/000/IMG_0001."""
     state: Literal["done", "kept", "error", "panel", "sky"]
     """`done`: processed in this run. `kept`: the result of an earlier run, with the same settings unless there is a
-    `why_kept`. `error`: there is no result. `panel`, `sky`: the capture shows a calibration panel or the sky, and is
+    `why_kept`. `error`: the capture has no result. `panel`, `sky`: it shows a calibration panel or the sky, and is
     not aligned.
     """
     result: Sidecar | None = field(default=None, repr=False)

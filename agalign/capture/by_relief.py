@@ -112,7 +112,7 @@ def _common_parallax_px(group: Sequence[RefinedBand]) -> tuple[float, bool]:
     line without tags that confirm them.
     """
     residuals = _common_residuals(group)
-    # The p95 is robust, as a wrong peak is no parallax.
+    # The p95 ignores single wrong peaks, which are not parallax.
     if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
         return 0.0, False
     windows = WindowShifts.of(residuals, [band.warped.mapping for band in group])

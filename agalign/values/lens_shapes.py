@@ -23,7 +23,7 @@ CALIBRATED = 0.4
 """Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
 _VARIANCE_FACTOR = 12.0
 """Factor on the variance of shifts for lens shapes: these extrapolate errors by relief, which neighbouring windows have
-in common. In an adjustment, the parallax of each window takes the relief, and there is no factor. Assumed."""
+in common. `adjust` does not need it, because it fits the parallax of each window. The value is assumed."""
 
 
 def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:

@@ -18,9 +18,10 @@ from agalign.values.pixel_units import PixelScale
 
 _NOISE_PX_SIGMA2 = 48.0
 """RMS noise of the shift of a window times the squared height of its peak, in windows of 40 to 64 px: the median shift
-of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30. Windows
-of 100 and 160 px have 1.3 to 5 times as much. It contains wrong peaks: the scatter of phases alone, which is the noise
-of right peaks in windows of any size, gives noisy bands up to four times the expected error."""
+of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30. Shifts
+of windows of 100 and 160 px have 1.3 to 5 times that noise. The constant stands for wrong peaks too: with an estimate
+by the phases alone, which is accurate for right peaks in windows of any size, the expected errors of noisy bands are up
+to four times as large."""
 
 
 _TOLERATED_NOISE = 1 / 100

@@ -43,7 +43,7 @@ def test_events_that_the_plugin_shows_are_those_of_the_program() -> None:
     shown = set(re.findall(r'kind == "(\w+)"', listener))
     program = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "agalign" / "cli").glob("*.py"))
     assert "found" in shown
-    assert shown - {"text"} <= set(re.findall(r'event\(\s*"(\w+)"', program))  # `text` is a line that is no event
+    assert shown - {"text"} <= set(re.findall(r'event\(\s*"(\w+)"', program))  # `text`: lines that are not events
 
 
 def test_executable_of_the_setting_or_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
