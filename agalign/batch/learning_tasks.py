@@ -203,6 +203,6 @@ def observe_rig(model: FlightModel, settings: Settings, capture: Capture) -> Lea
     with logged_failure(f"{capture.label} does not determine the rig"):
         pairs = [p for p in _pairs_of(capture, settings, model) if p.has_rig_pixels]
         estimation = CaptureEstimation(settings, _on_device(model, settings), quiet, is_observation=True)
-        estimation.align(pairs, None, scratch=False)
+        estimation.align(pairs, None, relearn=False)
         return LearningCapture.of(capture, estimation)
     return None

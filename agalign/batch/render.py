@@ -88,7 +88,7 @@ def render(
     context = ProductContext(capture, paths, settings, sidecar, alignments, (), whole, options, written, read)
     if context.with_pixels:
         layers, grid = output_layers(capture, context.with_pixels, write, options.common, read)
-        ties = tie_windows(capture, settings.seed, alignments, read) if write.tie_points else {}
+        ties = tie_windows(capture, alignments, read) if write.tie_points else {}
         context = replace(context, layers=layers, grid=grid, ties=ties)
     failures, lost = _write_products(context, written)
     here = {file.path for file in written}

@@ -8,10 +8,10 @@ from functools import partial
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import UnderRelief, by_relief
 from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, observed, rig_predictions
-from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is_extrapolated, spreads_of_relief_px
+from agalign.capture.by_windows import fitted_to_windows, in_windows_that_agree, is_extrapolated, spreads_of_relief_px
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
-from agalign.capture.full_resolution import at_full_resolution, is_reduced
+from agalign.capture.full_resolution import at_full_resolution, is_worth_refining
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.metrics import with_metrics
 from agalign.capture.seeding import corrected, find_seed, image_groups
@@ -19,7 +19,7 @@ from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.method.device import one_thread
-from agalign.method.joint import Results, align_from_scratch, refine_with
+from agalign.method.joint import Results, learn_and_refine, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
 from agalign.pixels.raster import ReadTile
@@ -84,7 +84,7 @@ def _as_written(alignment: Alignment, relief: Relief | None) -> Alignment:
 
 
 def tie_windows(
-    capture: Capture, settings: SeedSettings, alignments: Mapping[str, Alignment], read: ReadTile | None = None
+    capture: Capture, alignments: Mapping[str, Alignment], read: ReadTile | None = None
 ) -> dict[str, Residual]:
     """Return windows of the moving bands that did not fail, measured under their alignments, by band, px of the files.
 
@@ -92,7 +92,7 @@ def tie_windows(
     ones. Raises UnreadableFileError if the reference cannot be read.
     """
     result: dict[str, Residual] = {}
-    for pair in read_pairs(capture, settings, read=read)[0]:
+    for pair in read_pairs(capture, SeedSettings(), read=read)[0]:  # no seed is used
         alignment = alignments[pair.bands[0].name]
         if alignment.status != "failed":
             mapping = alignment.mapping.rescaled(pair.scales.fixed, pair.scales.moving)
@@ -131,17 +131,17 @@ class CaptureEstimation:
     reliefs: list[UnderRelief] = field(default_factory=list)
     """The candidates under each relief that fits the capture."""
 
-    def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True) -> Alignments:
+    def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, relearn: bool = True) -> Alignments:
         """Take all steps; return the alignments.
 
-        Pairs that the flight's network cannot align are learned from scratch, with a rig only those without an accurate
-        prediction; without `scratch`, only pairs that the network does not contain.
+        For pairs that the flight's network cannot align, one of the capture is learned, with a rig only for those
+        without an accurate prediction; without `relearn`, only for pairs that the network does not contain.
         """
         self._find_seeds(pairs)
         if self.settings.seed.only:
             return self.decided()
         self._refine()
-        result = self._learn(self.decided(), capture, scratch=scratch)
+        result = self._learn(self.decided(), capture, relearn=relearn)
         result = self._fit_windows(result)
         if self.is_observation:
             return result
@@ -194,9 +194,9 @@ class CaptureEstimation:
         others = self._optimised(again, refined, sides)
         self.add(results | {name: result for name, result in others.items() if is_retrieved(result)})
 
-    def _learn(self, result: Alignments, capture: Capture | None, *, scratch: bool) -> Alignments:
-        """Align bands with networks that are learned from scratch; return the alignments then."""
-        done = {b.pair.name for b in self.refined if not scratch or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
+    def _learn(self, result: Alignments, capture: Capture | None, *, relearn: bool) -> Alignments:
+        """Align bands with networks that are learned on the capture alone; return the alignments then."""
+        done = {b.pair.name for b in self.refined if not relearn or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
         remaining = {name: seed for name, seed in self.seeds.items() if name not in done}
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
@@ -205,7 +205,7 @@ class CaptureEstimation:
         if not remaining:
             return result
         joint = self.settings.joint
-        self.add(self._optimised(remaining, lambda group, report: align_from_scratch(group, joint, report)))
+        self.add(self._optimised(remaining, lambda group, report: learn_and_refine(group, joint, report)))
         return self.decided()
 
     def _fit_windows(self, result: Alignments) -> Alignments:
@@ -216,7 +216,7 @@ class CaptureEstimation:
         for band in lost:
             by_windows = fitted_to_windows(band)
             if by_windows is None or not by_windows.may_predict:
-                by_windows = agreeing_with_seed(band)
+                by_windows = in_windows_that_agree(band)
             band.candidates += [] if by_windows is None else [by_windows]
         return self.decided()
 
@@ -245,7 +245,7 @@ class CaptureEstimation:
         """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
         aligned = {name: alignment for name, alignment in result.items() if alignment.status == "aligned"}
         planes = [self.bands[name] for name, alignment in aligned.items() if alignment.mapping.parallax is None]
-        reduced = [band for band in planes if is_reduced(band.pair)]
+        reduced = [band for band in planes if is_worth_refining(band.pair)]
         for band in reduced:
             refined = at_full_resolution(capture.reference, band.accepted[-1])
             if isinstance(refined, Issue):
@@ -268,18 +268,21 @@ class CaptureEstimation:
     def add(self, results: Results) -> None:
         """Combine the results of some bands with those of the other bands by MAP estimation, and add the candidates.
 
+        A result whose descriptors are retrieved is not replaced by one whose descriptors are not.
         For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not
         replaced by a relief or a displacement field.
         """
+        if not results:
+            return
         seeds = self.seeds
         for name, result in results.items():
             found = self.bands[name]
             found.issue = result if isinstance(result, Issue) else None
-            if found.refined is None or found.issue is None:
+            if found.refined is None or is_retrieved(result) or not found.refined.joint.is_retrieved:
                 found.refined = RefinedBand.of(found.pair, seeds[name], result)
         use = self.settings.relief.use if self._may_be_homography else "never"
         bands = self._combined()
-        self.progress(next(iter(results), ""), "relief", 0.0)
+        self.progress(next(iter(results)), "relief", 0.0)  # with the name of the first band
         reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
         self.reliefs += reliefs
         under = set.intersection(*map(set, self.reliefs)) if self.reliefs else set()  # whichever of them is chosen
@@ -309,7 +312,7 @@ class CaptureEstimation:
 
 
 def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
-    """Return the bands to learn from scratch if the flight's network did not align them.
+    """Return the bands that need a network of the capture if that of the flight did not align them.
 
     Bands are skipped if the rig predicts them with a standard error of at most DELIVERED_STD_PX, or if they have
     no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower

@@ -194,15 +194,17 @@ def read_pairs(
             issue = Issue(NO_SUCH_SEED, detail=str(settings.force))
             unusable |= dict.fromkeys((b.name for b in bands), issue)
             continue
-        try:
-            images = [read_for_alignment(b, LONGEST_SIDE_PX, read) for b in bands]
-        except AgalignError as error:
-            unusable |= dict.fromkeys((b.name for b in bands), Issue(UNREADABLE, detail=str(error)))
+        by_name: dict[str, Raster] = {}
+        for band in bands:
+            try:
+                by_name[band.name] = read_for_alignment(band, LONGEST_SIDE_PX, read)
+            except AgalignError as error:
+                unusable[band.name] = Issue(UNREADABLE, detail=str(error))
+        if not by_name:
             continue
         longest = longest_for(capture.reference, next(iter(matrices.values())))
         if longest not in references:
             references[longest] = Reference(read_for_alignment(capture.reference, longest, read))
-        by_name = {b.name: image for b, image in zip(bands, images, strict=True)}
         usable = {name: image for name, image in by_name.items() if textured(image)} or by_name
         unusable |= {n: blank_issue(image, BLANK_MOVING) for n, image in by_name.items() if n not in usable}
         moving = _mean(_mostly_valid(list(usable.values())))

@@ -293,7 +293,7 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Un
     result |= estimate.of_other_bands(others)
     if any(band.pair.has_rig for band in group):
         return result
-    return {name: _with_field(candidate) for name, candidate in result.items()}
+    return {name: _with_field_on_relief(candidate) for name, candidate in result.items()}
 
 
 @dataclass(frozen=True)
@@ -413,7 +413,7 @@ class _Estimate:
         return {}
 
 
-def _with_field(candidate: Candidate) -> Candidate:
+def _with_field_on_relief(candidate: Candidate) -> Candidate:
     """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it: those of the
     field have to pass the checks too, unless the candidate does not pass without it.
     """

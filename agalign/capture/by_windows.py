@@ -57,7 +57,7 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     return Candidate.of(WarpedPair.of(pair, mapping, start.windows), joint, fitted.held_out)
 
 
-def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
+def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
     """Return the candidate of a coarse band by windows that agree with its trusted seed; None if few do, or in a
     repetitive scene.
     """

@@ -79,6 +79,12 @@ class Candidate:
         return () if self.images is None else self.images.issues
 
     @property
+    def p95_by_geometry(self) -> dict[Geometry, float]:
+        """`held_out_p95_px` with that of the candidate which it refines."""
+        earlier = {} if self.refined_from is None else self.refined_from.p95_by_geometry
+        return {**earlier, **self.held_out_p95_px}
+
+    @property
     def may_predict(self) -> bool:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
         found = (*self.issues, *self._issues_of_pixels) if self.given_issues is None else ()
@@ -174,7 +180,7 @@ class RefinedBand:
         return warped if self.by_halves is None else warped.cross_validated(self.by_halves)
 
     def candidates(self, use: ReliefUse) -> Iterator[Candidate]:
-        """Yield the homography, then the same with a displacement field, or with the p95 of both if it is rejected.
+        """Yield the homography, then the same with a displacement field if that passes too.
 
         A field is fitted if parallax may cause all issues of the homography, or if there are none and no rig contains
         the distortion of the lenses; always with `use` "always", not with "never".
@@ -182,10 +188,11 @@ class RefinedBand:
         band = self._unchanged_if_aligned
         joint, verified = band.joint, band.verified
         plane = Candidate.of(verified, joint)
-        yield plane
         is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not self.pair.has_rig))
         if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
             yield from _with_field(plane, verified, joint)
+        else:
+            yield plane
 
     @property
     def _unchanged_if_aligned(self) -> "RefinedBand":
@@ -215,22 +222,23 @@ class RefinedBand:
 
 
 def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
-    """Yield the candidate with a displacement field, verified by windows that it is not fitted to; the same without one
-    if the field does not reduce their shifts, or if only the homography passes.
+    """Yield the homography with the p95 of both geometries, then the same with a displacement field, verified by
+    windows that it is not fitted to; without it if it does not reduce their shifts, or if only the homography passes.
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
     if displacement is None:
+        yield plane
         return
     p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
-    without = replace(plane, held_out_p95_px=p95_px)
+    yield replace(plane, held_out_p95_px=p95_px)
     if displacement.field is None:
-        yield without
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of(displaced, joint, displacement.held_out)
     with_field = replace(held_out, other_residual=displaced.residual, held_out_p95_px=p95_px)
-    yield without if with_field.issues and not plane.issues else with_field
+    if plane.issues or not with_field.issues:
+        yield with_field
 
 
 def result_of_windows(fixed_to_moving: Matrix) -> JointResult:

@@ -1,6 +1,7 @@
-"""Which mapping a band gets, and its status: the one place that decides, given all candidates of a capture.
+"""Which of its candidates a band gets, and the status that follows.
 
-The estimators propose; `decide` chooses. For each band, the first row that applies:
+An estimator proposes only what it has reason to: a field that its own windows reject is no candidate, nor is a relief
+that fits fewer than half of the bands. `decide` chooses among the proposals. For each band, the first row that applies:
 
 | chosen                                    | if                                               | status      |
 |-------------------------------------------|--------------------------------------------------|-------------|
@@ -87,7 +88,7 @@ class _Choice:
     def alignment(self) -> Alignment:
         """The alignment: this is the only place that makes those of pairs of images."""
         band, chosen = self.band, self.candidate
-        pair, p95_px = band.pair, {kind: p95 for c in band.candidates for kind, p95 in c.held_out_p95_px.items()}
+        pair = band.pair
         if chosen is None:
             is_usable = band.is_start_trusted and band.does_start_fit and not self.is_seed_refused
             is_misfit = band.is_start_trusted and not band.does_start_fit and not self.is_seed_refused
@@ -98,7 +99,7 @@ class _Choice:
                 band.start,
                 joint=band.joint,
                 residual=None if self.is_seed_refused or band.at_start is None else band.at_start.residual,
-                held_out_p95_px=p95_px,
+                held_out_p95_px=band.candidates[-1].p95_by_geometry if band.candidates else {},
                 is_seed_usable=is_usable,
             )
         return Alignment(
@@ -108,7 +109,7 @@ class _Choice:
             band.start,
             joint=band.joint if chosen.joint is None else chosen.joint,
             residual=chosen.residual,
-            held_out_p95_px={**p95_px, **chosen.held_out_p95_px},
+            held_out_p95_px=chosen.p95_by_geometry,
             prediction=_prediction(chosen, self.compared) if self.issues else self.compared,
             error=chosen.error,
             std_px=chosen.std_px,

@@ -35,7 +35,7 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
 
 
-def is_reduced(pair: BandPair) -> bool:
+def is_worth_refining(pair: BandPair) -> bool:
     """Return True if a refinement on the files is worthwhile, because they have many more pixels than the images."""
     max_scale = 0.7  # of the images relative to their files
     return min(*pair.scales.moving, *(() if pair.is_coarse else pair.scales.fixed)) < max_scale

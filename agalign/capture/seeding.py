@@ -98,10 +98,11 @@ def seed_to_use(pair: BandPair, found: Seed | Issue, *, is_asked_for: bool = Fal
     if isinstance(found, Issue):
         kind, matrix = next(iter(matrices.items()))
         return Seed(kind, matrix, 0.0)
-    known = min(((std_px[kind], kind) for kind in std_px if kind in matrices), default=None)
+    # The smallest standard error; of equal ones, the first in order of preference.
+    known = min((kind for kind in matrices if kind in std_px), key=std_px.__getitem__, default=None)
     if known is None or is_asked_for or pair.is_expected(found.fixed_to_moving):
         return found
-    return Seed(known[1], matrices[known[1]], 0.0, trusted=True)
+    return Seed(known, matrices[known], 0.0, trusted=True)
 
 
 def corrected(pair: BandPair, seed: Seed) -> Seed | None:

@@ -31,7 +31,7 @@ Results = dict[str, JointResult | Issue]
 """The result for each moving image by its name, or the reason why there is none."""
 
 
-def align_from_scratch(
+def learn_and_refine(
     group: ImageGroup,
     settings: JointSettings,
     progress: Progress,

@@ -12,19 +12,21 @@ import agalign
 from agalign.cameras.discover import discover
 from agalign.capture.band_pair import _seed_std_px, read_pairs
 from agalign.capture.by_rig import observed
-from agalign.capture.full_resolution import is_reduced
+from agalign.capture.full_resolution import is_worth_refining
 from agalign.capture.reference import longest_for
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
+from agalign.errors import UnreadableFileError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import CaptureFactors, Rig
-from agalign.pixels.raster import probe
+from agalign.pixels.raster import probe, read_tile
 from agalign.synthetic.flight import score_against_truth
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.geometry import PairScales
-from agalign.values.issues import Issue, sentence
+from agalign.values.image import Tile
+from agalign.values.issues import UNREADABLE, Issue, sentence
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 from ..builders import joint_result, pair_of, whole
@@ -78,6 +80,17 @@ def test_one_bad_band_of_a_lens_does_not_mask_the_others(
         assert sentence(unusable[bad]) == reason
 
 
+def test_an_unreadable_band_of_a_lens_does_not_fail_the_others(tmp_path: Path) -> None:
+    def read(band: Band, tile: Tile) -> tuple[np.ndarray, np.ndarray]:
+        if band.name == "b3":
+            raise UnreadableFileError(f"{band.path} is damaged")
+        return read_tile(band, tile)
+
+    (pair,), unusable = read_pairs(mosaic(tmp_path, lambda _: None), SeedSettings(force="identity"), read=read)
+    assert [band.name for band in pair.bands] == ["b1", "b2", "b4"]
+    assert {name: issue.kind for name, issue in unusable.items()} == {"b3": UNREADABLE}
+
+
 def test_a_file_with_few_valid_pixels_says_how_few(tmp_path: Path) -> None:
     def change(planes: np.ndarray) -> None:
         planes[:, 2:] = 0
@@ -100,7 +113,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
 @pytest.mark.parametrize(
     ("ratio", "longest"), [(1.0, 2700), (2.0, 2700), (0.5, 2700), (0.25, 640), (0.0775, 198), (0.01, 128), (0.0, 2700)]
 )
-def test_the_reference_is_reduced_for_a_coarse_band(ratio: float, longest: int) -> None:
+def test_the_reference_is_worth_refining_for_a_coarse_band(ratio: float, longest: int) -> None:
     band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")
     mapping = np.diag([abs(ratio), ratio, 1.0])
     assert longest_for(band, mapping) == longest
@@ -128,7 +141,10 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
         assert score.median_px < (0.3 if score.band == "LWIR" else 0.1)
     capture = discover(tmp_path).captures[0]
     pairs, _ = read_pairs(capture, SeedSettings())
-    assert [(p.name, p.is_coarse, is_reduced(p)) for p in pairs] == [("NIR", False, False), ("LWIR", True, False)]
+    assert [(p.name, p.is_coarse, is_worth_refining(p)) for p in pairs] == [
+        ("NIR", False, False),
+        ("LWIR", True, False),
+    ]
     assert 270 < pairs[1].fixed.size_px[0] < 310  # about two pixels per pixel of the thermal band
     assert pairs[1].reference_file_px == (800, 600)
 

@@ -26,7 +26,7 @@ from agalign.capture.by_relief import (
     _Estimate,
     _fits_better,
     _std_px,
-    _with_field,
+    _with_field_on_relief,
     by_relief,
 )
 from agalign.capture.by_rig import _parallax_by_rig, observed, rig_predictions
@@ -568,7 +568,7 @@ def test_a_field_on_a_relief_is_verified_by_windows_that_it_is_not_fitted_to(
         held_out = residual_of(under.residual.centres_px, np.array([shift_px, 0.0]))
         found = DisplacementResult(field, 1.0, 0.5, held_out)
         monkeypatch.setattr(DisplacementEstimator, "refine", lambda *_, found=found: found)
-        assert (_with_field(under) is not under) == is_used
+        assert (_with_field_on_relief(under) is not under) == is_used
 
 
 def test_use(candidates: Sequence[RefinedBand]) -> None:

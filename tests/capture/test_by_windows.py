@@ -263,14 +263,14 @@ def test_a_coarse_band_with_another_field_of_view_is_predicted_with_its_error(
 
 def test_a_coarse_band_without_any_candidate_is_not_verified_by_the_windows_of_its_fit(scene: np.ndarray) -> None:
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
-    by_windows = module.agreeing_with_seed(BandCandidates(band.pair, band.seed))
+    by_windows = module.in_windows_that_agree(BandCandidates(band.pair, band.seed))
     assert by_windows.issues == (Issue(OTHER_GEOMETRY),)
 
 
 def test_a_coarse_band_has_the_error_of_the_relief_of_its_flight(scene: np.ndarray) -> None:
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
     over_trees = replace(band.pair, relief_std_px=3.0)
-    assert module.agreeing_with_seed(BandCandidates(over_trees, band.seed)).error.relief_std_px == 3.0
+    assert module.in_windows_that_agree(BandCandidates(over_trees, band.seed)).error.relief_std_px == 3.0
 
 
 def test_areas_without_data_do_not_count_in_a_georeferenced_coarse_band(scene: np.ndarray) -> None:
@@ -279,7 +279,7 @@ def test_areas_without_data_do_not_count_in_a_georeferenced_coarse_band(scene: n
     valid = reference.valid & (np.arange(FIXED_PX[0]) >= 100)
     matrices = {"geo": band.seed.fixed_to_moving, **band.pair.seed_matrices}
     pair = replace(band.pair, reference=Reference(replace(reference, valid=valid)), seed_matrices=matrices)
-    by_windows = module.agreeing_with_seed(BandCandidates(pair, band.seed, band.issue))
+    by_windows = module.in_windows_that_agree(BandCandidates(pair, band.seed, band.issue))
     assert by_windows.common_px[:, 0].min() > 90
 
 

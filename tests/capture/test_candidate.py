@@ -132,14 +132,19 @@ def displaced_pair(height_px: float, wavelength_px: float | None = None) -> Band
     return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
 
 
-def test_a_later_optimisation_without_a_result_does_not_replace_an_earlier_one() -> None:
+@pytest.mark.parametrize("later", [Issue(RETRIEVAL, 0.0, 0.2), joint_result(retrieval=0.05)])
+def test_a_later_optimisation_that_retrieves_nothing_does_not_replace_an_earlier_one(
+    later: JointResult | Issue,
+) -> None:
     """The band still takes part in the estimation of the others."""
     estimation = estimation_of(BandCandidates(displaced_pair(0.0), CENTRED))
-    for result in (joint_result(), Issue(RETRIEVAL, 0.0, 0.2)):
+    for result in (joint_result(), later):
         estimation.add({"moving": result})
     (band,) = estimation.refined
     assert band.joint.retrieval == joint_result().retrieval
-    assert estimation.bands["moving"].issue is not None
+    assert (estimation.bands["moving"].issue is None) == isinstance(later, JointResult)
+    estimation.add({"moving": joint_result(retrieval=0.7)})
+    assert estimation.refined[0].joint.retrieval == 0.7
 
 
 @pytest.mark.parametrize(

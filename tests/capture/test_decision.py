@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agalign.capture import decision
-from agalign.capture.band_pair import BandPair
+from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.by_relief import UnderRelief
 from agalign.capture.by_rig import RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
@@ -187,6 +187,25 @@ def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping() -> None
     assert decided(pair(), far, (), LOST).seed == far
     assert decided(tagged, far, (), asked_for).seed == far
     assert decided(pair(), replace(SEED, trusted=False), (), asked_for).status == "seed_only"
+
+
+def test_of_tags_with_the_same_standard_error_the_preferred_one_replaces_a_seed() -> None:
+    tags: SeedMatrices = {"rig": RIG["rig"], "centre": np.eye(3)}
+    tagged = replace(pair(), seed_matrices=tags, seed_std_px={"rig": 5.0, "centre": 5.0})
+    assert decided(tagged, replace(FAR, kind="match"), (), LOST).seed.kind == "rig"
+    certain = replace(tagged, seed_std_px={"rig": 5.0, "centre": 4.0})
+    assert decided(certain, replace(FAR, kind="match"), (), LOST).seed.kind == "centre"
+
+
+def test_the_p95_of_an_estimate_that_is_not_chosen_is_not_recorded() -> None:
+    first = candidate(shift_px=1.5, held_out_p95_px={"homography": 2.0, "field": 1.8})
+    chosen = candidate(held_out_p95_px={"homography": 0.4})
+    assert decided(pair(), SEED, [first, chosen]).held_out_p95_px == {"homography": 0.4}
+    on_tiles = candidate(refined_from=chosen)
+    assert decided(pair(), SEED, [first, on_tiles]).held_out_p95_px == {"homography": 0.4}
+    assert against(rig_prediction(), first).held_out_p95_px == {}
+    untried = unconfirmed(held_out_p95_px={"homography": 2.0})
+    assert decided(pair(), SEED, [untried, unconfirmed()]).held_out_p95_px == {}
 
 
 def test_a_band_without_a_seed_has_failed() -> None:

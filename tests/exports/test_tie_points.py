@@ -1,6 +1,7 @@
 """Tie points are measured: they match the truth even where the alignment that they are measured under does not."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
+from agalign.cameras.discover import discover
+from agalign.capture.align_bands import align_capture_bands, tie_windows
 from agalign.exports.tie_points import _geojson
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Georeference
@@ -55,6 +58,15 @@ def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp
     assert [f["properties"]["band"] for f in features] == [r["band"] for r in rows]
     x, y = features[0]["geometry"]["coordinates"]
     assert (x, y) == (float(rows[0]["reference_x_px"]) + 0.5, -float(rows[0]["reference_y_px"]) - 0.5)
+
+
+def test_bands_without_the_tags_of_the_forced_seed_have_tie_points(flight: Path) -> None:
+    """They are aligned by the model of the flight."""
+    capture = discover(flight).captures[0]
+    bare = replace(capture, bands=tuple(replace(b, to_rig=None, other_to_rig=None) for b in capture.bands))
+    settings = agalign.Settings(seed=agalign.SeedSettings(only=True))
+    alignments = align_capture_bands(capture, settings, None, lambda *_: None)
+    assert tie_windows(bare, alignments).keys() == alignments.keys()
 
 
 @pytest.mark.full

@@ -17,7 +17,7 @@ from agalign.flight.model import load_model, save_model
 from agalign.method import device
 from agalign.method.device import choose_device, one_memory_error, one_thread
 from agalign.method.fast import Schedule
-from agalign.method.joint import align_from_scratch
+from agalign.method.joint import learn_and_refine
 from agalign.method.paper import Training
 from agalign.method.state import ImageGroup, MovingImage
 from agalign.values import geometry
@@ -104,7 +104,7 @@ def test_a_gpu_gives_the_result_of_the_cpu(
         rgb, band = whole(np.stack([fixed, 0.5 * fixed, -fixed]), lens), whole(moving, lens)
         seed, settings = geometry.translation(7.0, -5.0), JointSettings(recipe=recipe, device=name)
         group = ImageGroup(rgb, [MovingImage(band, seed, max_shift_px=9.0, field=field)])
-        (result,) = align_from_scratch(group, settings, lambda *_: None, **short).values()
+        (result,) = learn_and_refine(group, settings, lambda *_: None, **short).values()
         assert result.iterations > 0
         return result
 

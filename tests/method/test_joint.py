@@ -6,7 +6,7 @@ import torch
 
 from agalign.config import JointSettings
 from agalign.method.fast import learn_scales
-from agalign.method.joint import align_from_scratch
+from agalign.method.joint import learn_and_refine
 from agalign.method.paper import DEFAULT_TRAINING, Training
 from agalign.method.state import ImageGroup, MovingImage
 from agalign.values import geometry
@@ -34,7 +34,7 @@ def scratch(
     **settings: Any,
 ) -> JointResult | Issue:
     group = ImageGroup(fixed, [MovingImage(moving, seed, trusted=trusted)])
-    (result,) = align_from_scratch(group, JointSettings(**settings), lambda *_: None, training=training).values()
+    (result,) = learn_and_refine(group, JointSettings(**settings), lambda *_: None, training=training).values()
     return result
 
 

@@ -18,7 +18,7 @@ from ..conftest import textured_image, write_band
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
-def test_a_photograph_is_reduced_by_averaging(tmp_path: Path) -> None:
+def test_a_photograph_is_worth_refining_by_averaging(tmp_path: Path) -> None:
     scene = (128 + 30 * textured_image(640, 480)).clip(1, 254).astype(np.uint8)
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), np.stack([scene, scene // 2, scene // 3], axis=-1), [cv2.IMWRITE_JPEG_QUALITY, 98])
