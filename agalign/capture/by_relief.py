@@ -42,7 +42,7 @@ from agalign.values.image import FloatImage
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual, decrease_in_standard_errors, lengths_in_common_px
-from agalign.verify.checks import BY_PARALLAX, MAX_SHIFT_PX
+from agalign.verify.checks import MAX_SHIFT_PX, PREDICTED_WITH
 
 MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
@@ -263,9 +263,8 @@ def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
         # Planes of different depth resemble a repetition in images without relief.
         verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.relief_check_windows, held_out)
         candidate = band.candidate(mapping, verified)
-        # A window across a depth edge contains the parallax of neither side. Pixels are not checked where it causes
-        # other issues: bands of a bench with plants would be no observations, and it would have no rig.
-        issues = [issue for issue in candidate.issues if issue.kind not in BY_PARALLAX]
+        # A window across a depth edge contains the parallax of neither side, and may contain other plants.
+        issues = [issue for issue in (*candidate.issues, *verified.issues) if issue.kind not in PREDICTED_WITH]
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
             result[band.name] = replace(candidate, given_issues=())

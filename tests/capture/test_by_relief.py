@@ -33,6 +33,7 @@ from agalign.capture.by_rig import _parallax_by_rig, observed, rig_predictions
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
 from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
+from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.displacement_field import DisplacementEstimator, DisplacementResult
 from agalign.flight.rig import Rig
@@ -44,7 +45,16 @@ from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix, PairScales
 from agalign.values.image import Raster
-from agalign.values.issues import CLOSE_WINDOWS, NO_CONTRAST, RETRIEVAL, Issue, IssueKind
+from agalign.values.issues import (
+    CLOSE_WINDOWS,
+    CLUSTER,
+    NO_CONTRAST,
+    OTHER_CONTENT,
+    REPEATS,
+    RETRIEVAL,
+    Issue,
+    IssueKind,
+)
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
@@ -556,6 +566,14 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
             # The parallax of a pixel is that of the nearest window, on slopes too.
             assert np.median(four_lenses.error_px(name, alignment.mapping)) < 0.6
             assert alignment.joint.corner_std_px < 0.5
+
+
+def test_an_observation_of_the_rig_is_no_alias(four_lenses: Rendered, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither if parallax causes other issues, which do not matter."""
+    monkeypatch.setattr("agalign.capture.candidate.issues_of", lambda *_: (Issue(CLUSTER, 0.5, 0.1),))
+    for found, is_observed in ((Issue(REPEATS, 12.0), False), (Issue(OTHER_CONTENT, 0.1, 0.0), True)):
+        monkeypatch.setattr(WarpedPair, "issues", (found,))
+        assert bool(aligned_by_relief(four_lenses.refined({}), "auto", is_observation=True)[0]) is is_observed
 
 
 def test_a_field_on_a_relief_is_verified_by_windows_that_it_is_not_fitted_to(
