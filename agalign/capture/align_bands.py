@@ -196,12 +196,10 @@ class CaptureEstimation:
 
     def _learn(self, result: Alignments, capture: Capture | None, *, relearn: bool) -> Alignments:
         """Align bands with networks that are learned on the capture alone; return the alignments then."""
-        done = {b.pair.name for b in self.refined if not relearn or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
-        remaining = {name: seed for name, seed in self.seeds.items() if name not in done}
         rig = None if self.model is None else self.model.rig
-        if remaining and capture is not None and rig is not None:
-            names = bands_to_learn(self.pairs, result, rig, capture)
-            remaining = {name: seed for name, seed in remaining.items() if name in names}
+        without = {name for name, band in self.bands.items() if band.refined is None}  # not in the flight's network
+        names = bands_to_learn(self.pairs, result, rig, capture) if relearn else without
+        remaining = {name: seed for name, seed in self.seeds.items() if name in names}
         if not remaining:
             return result
         joint = self.settings.joint
@@ -243,9 +241,7 @@ class CaptureEstimation:
 
     def _refine_on_files(self, result: Alignments, capture: Capture) -> Alignments:
         """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
-        aligned = {name: alignment for name, alignment in result.items() if alignment.status == "aligned"}
-        planes = [self.bands[name] for name, alignment in aligned.items() if alignment.mapping.parallax is None]
-        reduced = [band for band in planes if is_worth_refining(band.pair)]
+        reduced = [band for name, band in self.bands.items() if is_worth_refining(band.pair, result[name])]
         for band in reduced:
             refined = at_full_resolution(capture.reference, band.accepted[-1])
             if isinstance(refined, Issue):
@@ -311,27 +307,29 @@ class CaptureEstimation:
         return self.settings.joint.model_family in ("auto", "homography")
 
 
-def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
-    """Return the bands that need a network of the capture if that of the flight did not align them.
+def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None, capture: Capture | None) -> set[str]:
+    """Return the bands for which a network of the capture is learned: those that are not usable without one.
 
-    Bands are skipped if the rig predicts them with a standard error of at most DELIVERED_STD_PX, or if they have
+    With a `rig` they are skipped if it predicts them with a standard error of at most DELIVERED_STD_PX, or if they have
     no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
     height than those of the flight's network.
     """
+    lost = [pair.name for pair in pairs if not result[pair.name].is_usable(DELIVERED_STD_PX)]
+    if not lost or rig is None or capture is None:
+        return set(lost)
     predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
 
-    def is_skipped(pair: BandPair) -> bool:
-        alignment = result.get(pair.name)
-        if alignment is None or pair.name not in predictions:
+    def is_skipped(name: str) -> bool:
+        if name not in predictions:
             return False
-        joint = alignment.joint
+        alignment, joint = result[name], result[name].joint
         # Fewer patches than a result needs: a network of its own may retrieve more.
         is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
         # A seed that replaced one that contradicts it has no score: the images do not confirm it.
         has_common_structure = (alignment.seed.trusted and alignment.seed.score > 0) or is_above_chance
-        return not has_common_structure or predictions[pair.name].of_scene.std_px <= DELIVERED_STD_PX
+        return not has_common_structure or predictions[name].of_scene.std_px <= DELIVERED_STD_PX
 
-    return {pair.name for pair in pairs if not is_skipped(pair)}
+    return {name for name in lost if not is_skipped(name)}
 
 
 def is_retrieved(result: JointResult | Issue) -> bool:

@@ -268,7 +268,7 @@ def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
             result[band.name] = replace(candidate, given_issues=())
-    return result if _fits_better(bands, result) else {}
+    return result if _is_accepted(bands, result) else {}
 
 
 def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> UnderRelief:
@@ -287,7 +287,7 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Un
     result: dict[str, Candidate] = {}
     for band, warped in zip(estimate.bands, held_out, strict=True):
         result |= estimate.candidate(band, warped)
-    if not _fits_better(estimate.bands, result):
+    if not _is_accepted(estimate.bands, result):
         return {}
     result |= estimate.of_other_bands(others)
     if any(band.pair.has_rig for band in group):
@@ -429,7 +429,7 @@ def _with_field_on_relief(candidate: Candidate) -> Candidate:
     return candidate if result.issues and not candidate.issues else result
 
 
-def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:
+def _is_accepted(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:
     """Return True if held-out windows of half of the bands fit a relief better than a homography.
 
     A band that it predicts counts only if a homography cannot align it: fields follow small parallax better.

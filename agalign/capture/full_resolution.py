@@ -20,6 +20,7 @@ from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import OpenRaster, open_raster, read_tile
 from agalign.pixels.structure import structure_field
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
@@ -35,8 +36,10 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
 
 
-def is_worth_refining(pair: BandPair) -> bool:
-    """Return True if a refinement on the files is worthwhile, because they have many more pixels than the images."""
+def is_worth_refining(pair: BandPair, alignment: Alignment) -> bool:
+    """Return True for an aligned band without a relief whose files have many more pixels than the images."""
+    if alignment.status != "aligned" or alignment.mapping.parallax is not None:
+        return False
     max_scale = 0.7  # of the images relative to their files
     return min(*pair.scales.moving, *(() if pair.is_coarse else pair.scales.fixed)) < max_scale
 

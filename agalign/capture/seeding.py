@@ -61,21 +61,19 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     has_scale = bool(pair.seed_matrices.keys() & {"rig", "centre", "geo", "model", "user"})
     if not best.trusted and not has_scale:
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
-    return _best_match(pair, best)
-
-
-def _best_match(pair: BandPair, best: Seed) -> Seed:
-    """Return a match with a smaller residual than the best seed, or that seed.
-
-    No match is needed if images, tags and windows confirm the seed. If tags and windows confirm it, a match also needs
-    a higher correlation peak: equal plants in a square grid match after a quarter turn too, with a smaller residual
-    where there is parallax.
-    """
     given = WarpedPair.of(pair, pair.mapping(best.fixed_to_moving))
     # The mapping of the tags confirms the image centre, the windows confirm the corners.
     is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(given.residual)
-    if best.trusted and is_confirmed:
-        return best
+    return best if best.trusted and is_confirmed else _best_match(given, best, is_confirmed=is_confirmed)
+
+
+def _best_match(given: WarpedPair, best: Seed, *, is_confirmed: bool) -> Seed:
+    """Return a match with a smaller residual than the pair has with the best seed, or that seed.
+
+    If tags and windows confirm the seed, a match also needs a higher correlation peak: equal plants in a square grid
+    match after a quarter turn too, with a smaller residual where there is parallax.
+    """
+    pair = given.pair
     for mapping in _matches(pair):
         for match in _with_corrected(pair, mapping):
             if not seed_fits(match.residual) or not match.is_better_than(given):

@@ -6,7 +6,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.fit.windows import FixedWindows, held_out_residual, residual_under
+from agalign.fit.window_fit import held_out_residual
+from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry

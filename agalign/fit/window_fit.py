@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
-from agalign.fit.windows import Shifts, held_out_residual, peak_weights
+from agalign.fit.windows import Shifts, peak_weights, residual_under
 from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
@@ -240,6 +240,16 @@ def cross_fitted(
 
 
 # ---- all bands of a capture
+
+
+def held_out_residual(
+    residual: Residual, mapping: PixelMapping, by_black: PixelMapping, by_white: PixelMapping
+) -> Residual:
+    """Return the residual, measured with `mapping`, with the shift of each window under the mapping that was estimated
+    without it: from the black or the white windows of a chessboard.
+    """
+    black_px, white_px = (residual_under(residual, mapping, by).shifts_px for by in (by_black, by_white))
+    return residual.with_shifts(np.where(residual.is_even_cell[:, None], white_px, black_px))
 
 
 @dataclass(frozen=True)

@@ -221,16 +221,6 @@ def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping
     return residual.with_shifts(shifts - difference)
 
 
-def held_out_residual(
-    residual: Residual, mapping: PixelMapping, by_black: PixelMapping, by_white: PixelMapping
-) -> Residual:
-    """Return the residual, measured with `mapping`, with the shift of each window under the mapping that was estimated
-    without it: from the black or the white windows of a chessboard.
-    """
-    black_px, white_px = (residual_under(residual, mapping, by).shifts_px for by in (by_black, by_white))
-    return residual.with_shifts(np.where(residual.is_even_cell[:, None], white_px, black_px))
-
-
 def _grid(x: Sequence[int], y: Sequence[int]) -> NDArray[np.int64]:
     """Return (n, 2) all (x, y), row by row."""
     return np.stack(np.meshgrid(np.array(x, np.int64), np.array(y, np.int64)), axis=-1).reshape(-1, 2)

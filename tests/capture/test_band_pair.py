@@ -27,6 +27,7 @@ from agalign.values.capture import Band, Capture
 from agalign.values.geometry import PairScales
 from agalign.values.image import Tile
 from agalign.values.issues import UNREADABLE, Issue, sentence
+from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 from ..builders import joint_result, pair_of, whole
@@ -141,7 +142,8 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
         assert score.median_px < (0.3 if score.band == "LWIR" else 0.1)
     capture = discover(tmp_path).captures[0]
     pairs, _ = read_pairs(capture, SeedSettings())
-    assert [(p.name, p.is_coarse, is_worth_refining(p)) for p in pairs] == [
+    plane = Alignment(PixelMapping(np.eye(3)), (800, 600), (), Seed("identity", np.eye(3), 0.0))
+    assert [(p.name, p.is_coarse, is_worth_refining(p, plane)) for p in pairs] == [
         ("NIR", False, False),
         ("LWIR", True, False),
     ]

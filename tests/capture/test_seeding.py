@@ -192,7 +192,8 @@ def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_win
         return WarpedPair(pair, mapping, image, windows, residual_of(windows.centres_px, np.array([shift_px, 0.0])))
 
     monkeypatch.setattr(WarpedPair, "of", measured)
-    chosen = seeding._best_match(pair, seed)
+    given = WarpedPair.of(pair, pair.mapping(seed.fixed_to_moving))
+    chosen = seeding._best_match(given, seed, is_confirmed=is_confirmed)
     assert (chosen is seed) == is_confirmed
 
 
