@@ -141,7 +141,7 @@ class CaptureEstimation:
         if self.settings.seed.only:
             return self.decided()
         self._refine()
-        result = self._learn(self.decided(), capture, relearn=relearn)
+        result = self._learn(capture, relearn=relearn)
         result = self._fit_windows(result)
         if self.is_observation:
             return result
@@ -194,14 +194,15 @@ class CaptureEstimation:
         others = self._optimised(again, refined, sides)
         self.add(results | {name: result for name, result in others.items() if is_retrieved(result)})
 
-    def _learn(self, result: Alignments, capture: Capture | None, *, relearn: bool) -> Alignments:
+    def _learn(self, capture: Capture | None, *, relearn: bool) -> Alignments:
         """Align bands with networks that are learned on the capture alone; return the alignments then."""
-        rig = None if self.model is None else self.model.rig
-        without = {name for name, band in self.bands.items() if band.refined is None}  # not in the flight's network
-        names = bands_to_learn(self.pairs, result, rig, capture) if relearn else without
+        names, result = {name for name, band in self.bands.items() if band.refined is None}, Alignments()
+        if self.model is not None:  # else nothing is known, and the windows of all seeds would take long
+            result = self.decided()
+            names = bands_to_learn(self.pairs, result, self.model.rig, capture) if relearn else names
         remaining = {name: seed for name, seed in self.seeds.items() if name in names}
         if not remaining:
-            return result
+            return result or self.decided()
         joint = self.settings.joint
         self.add(self._optimised(remaining, lambda group, report: learn_and_refine(group, joint, report)))
         return self.decided()
