@@ -19,7 +19,7 @@ import typer
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures" / "figures.csv"
 HEAD = "fact", "value", "unit", "n", "command", "commit", "digest"
-UNITS = "px", "%", "s", "GB"
+UNITS = "px", "%", "s", "MB", "GB"
 FiguresOption = Annotated[
     bool, typer.Option("--figures", help="write the rows of this command in docs/figures/figures.csv")
 ]

@@ -4,7 +4,8 @@ python examples/training_tiles.py OUT
 
 OUT has stacks and quality flags (`--layout stack`, `--qa`). All bands have the pixels of the reference, so one label
 raster fits all of them: draw it over `<capture>.tif`, save it as `<capture>.labels.tif`, and read it by
-`Tiles(stacks, labels=True)`. In a loss per pixel, use `usable.all(0)`.
+`Tiles(stacks, labels=True)`. In a loss per pixel, use `usable[k].all(0)` of the bands k
+that the network gets.
 
 Neighbouring captures overlap: the split is by position, and no capture for validation has ground of one for training.
 That needs the footprints of `OUT/flight.geojson` (GPS position, altitude, yaw and focal length in the tags). With

@@ -248,11 +248,8 @@ def figures() -> dict[str, dict[str, str]]:
         return {row["fact"]: row for row in csv.DictReader(file)}
 
 
-TERMS = "[terms](../reference/glossary.md)"
-
-
 def figures_of(name: str) -> str:
-    """Return a table of docs/figures/figures.csv with a link to the definitions of its terms.
+    """Return a table of docs/figures/figures.csv.
 
     The command that makes it, and the commit at which it was measured if the code has changed since, are below, or in
     columns if the rows have different ones.
@@ -276,9 +273,9 @@ def figures_of(name: str) -> str:
         values = [cells[column]["value"] or "-" if column in cells else "-" for column, _ in columns]
         count = first[line]["n"].partition(" ")[0] if of_one_unit else first[line]["n"]
         rows.append((line, count, *values, *(n for n, (_, some) in zip(notes[line], further, strict=True) if some[1:])))
-    below = [TERMS] if commands[1:] else [commands[0], TERMS]
+    below = [] if commands[1:] else [commands[0]]
     below += [f"measured at {measured[0]}"] if measured[0] and not measured[1:] else []
-    return table(rows) + "\n\n" + ", ".join(below) + "\n"
+    return table(rows) + ("\n\n" + ", ".join(below) if below else "") + "\n"
 
 
 def measured_at(table_name: str, row: Mapping[str, str]) -> str:
