@@ -126,6 +126,8 @@ class CaptureEstimation:
     progress: PairProgress
     is_observation: bool = False
     """True while a flight is learned: residual lens distortion is fitted to all its captures together."""
+    capture: Capture | None = None
+    """The capture of the pairs, if its tags are known."""
     bands: dict[str, BandCandidates] = field(default_factory=dict)
     """What was found, by band."""
     reliefs: list[UnderRelief] = field(default_factory=list)
@@ -137,6 +139,7 @@ class CaptureEstimation:
         For pairs that the flight's network cannot align, one of the capture is learned, with a rig only for those
         without an accurate prediction; without `relearn`, only for pairs that the network does not contain.
         """
+        self.capture = capture
         self._find_seeds(pairs)
         if self.settings.seed.only:
             return self.decided()
@@ -187,12 +190,17 @@ class CaptureEstimation:
 
         seeds = {name: seed for name, seed in self.seeds.items() if name in sides}
         results = self._optimised(seeds, refined, sides)
-        # Tags may have the wrong scale: descriptors that do not align a seed may align it once windows correct it.
-        lost = {name: seed for name, seed in seeds.items() if not is_retrieved(results[name])}
-        other_seeds = {name: corrected(self.bands[name].pair, seed) for name, seed in lost.items()}
-        again = {name: seed for name, seed in other_seeds.items() if seed is not None}
+        lost = [self.bands[name] for name in seeds if not is_retrieved(results[name])]
+        again = {band.pair.name: seed for band in lost if (seed := self._other_seed(band)) is not None}
         others = self._optimised(again, refined, sides)
         self.add(results | {name: result for name, result in others.items() if is_retrieved(result)})
+
+    def _other_seed(self, band: BandCandidates) -> Seed | None:
+        """Return another seed for a band that the descriptors do not align at the one that was found: that of tags or
+        flight if these contradict it, else the same corrected by windows, as tags may have the wrong scale.
+        """
+        assert isinstance(band.seed, Seed)
+        return corrected(band.pair, band.seed) if band.start is band.seed else band.start
 
     def _learn(self, capture: Capture | None, *, relearn: bool) -> Alignments:
         """Align bands with networks that are learned on the capture alone; return the alignments then."""
@@ -209,7 +217,7 @@ class CaptureEstimation:
 
     def _fit_windows(self, result: Alignments) -> Alignments:
         """Fit windows alone where the descriptors have no result; return the alignments then."""
-        lost = [self.bands[name] for name, a in result.items() if a.status not in ("aligned", "predicted")]
+        lost = [self.bands[name] for name, a in result.items() if not a.is_usable(DELIVERED_STD_PX)]
         if not (lost and self._may_be_homography):
             return result
         for band in lost:
@@ -295,7 +303,7 @@ class CaptureEstimation:
         """Return the refined bands after the MAP estimation of all bands of the capture."""
         if not self._may_be_homography:  # as the MAP estimate is
             return self.refined
-        return with_map_estimates(self.refined, None if self.model is None else self.model.rig)
+        return with_map_estimates(self.refined, None if self.model is None else self.model.rig, self.capture)
 
     @property
     def refined(self) -> list[RefinedBand]:

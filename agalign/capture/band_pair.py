@@ -15,6 +15,7 @@ from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
+from agalign.flight.rig import Rig
 from agalign.flight.rig_prediction import unobserved_error_px
 from agalign.pixels.band_resampling import MIN_VALID_SHARE, channel_mean, textured, warped
 from agalign.pixels.raster import ReadTile, read_for_alignment
@@ -28,10 +29,11 @@ from agalign.values.image import Raster
 from agalign.values.issues import BLANK_MOVING, FEW_VALID, NO_SUCH_SEED, UNREADABLE, Issue, IssueKind
 from agalign.values.lens_shapes import lens_std_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.pixel_units import PixelScale
 
 SeedMatrices = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
+_TAGS: tuple[SeedKind, ...] = "rig", "centre"
+"""Initial mappings by tags."""
 _MAX_ERROR_STD = 3.0
 """Maximum error of an initial mapping in standard errors."""
 
@@ -143,21 +145,29 @@ class BandPair:
         """Warp the channel mean of the moving image to the grid of the reference."""
         return warped(channel_mean(self.moving_image), mapping, self.fixed.size_px)
 
+    @property
+    def expected_kind(self) -> SeedKind | None:
+        """The kind of initial mapping with the smallest standard error, of equal ones the preferred; None if no error
+        is known.
+        """
+        known = (kind for kind in self.seed_matrices if kind in self.seed_std_px)
+        return min(known, key=self.seed_std_px.__getitem__, default=None)
+
     def is_expected(self, fixed_to_moving: Matrix, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """Return True if a mapping agrees with an initial one within _MAX_ERROR_STD standard errors.
+        """Return True if a mapping agrees with that of `expected_kind` within _MAX_ERROR_STD standard errors.
 
         The mapping is shifted first by `shift_px` of the fixed image. The distance is measured in the fixed image, to
         which the standard errors refer, between the image centre and the point that the initial mapping maps to the
         same moving point.
         """
+        kind = self.expected_kind
+        if kind is None:
+            return False
         shifted = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
         centre_px = (np.array(self.fixed.size_px) - 1) / 2
         mapped_px = geometry.apply(shifted, centre_px)
-        for kind in self.seed_std_px.keys() & self.seed_matrices.keys():
-            expected_px = geometry.apply(geometry.invert(self.seed_matrices[kind]), mapped_px)
-            if float(np.linalg.norm(expected_px - centre_px)) <= self.seed_std_px[kind] * _MAX_ERROR_STD:
-                return True
-        return False
+        expected_px = geometry.apply(geometry.invert(self.seed_matrices[kind]), mapped_px)
+        return float(np.linalg.norm(expected_px - centre_px)) <= self.seed_std_px[kind] * _MAX_ERROR_STD
 
     @property
     def reference_file_px(self) -> tuple[int, int]:
@@ -239,25 +249,27 @@ def _pair(
     is_coarse = longest < min(LONGEST_SIDE_PX, max(band.size_px))
     scales = PairScales.of((band.size_px, bands[0].size_px), (reference.image.size_px, moving.size_px))
     reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
-    field = None if model is None or model.rig is None else model.rig.fields.get(name)
-    field = None if field is None else field.rescaled(scales.fixed)
-    std_px = _seed_std_px(name, model, scales.fixed)
-    pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, field)
-    rig = None if model is None else model.rig
-    if rig is not None and name in rig.mean:
-        relief_px = rig.parallax_px.get(name, 0.0) * scales.fixed.mean
-        pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px)
-    return replace(pair, layout=relative_parallax(band, bands[0]))
-
-
-def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, float]:
-    """Return the standard errors of mappings by tags and of the flight's mean; `scale` is of the fixed image."""
     tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/reference/cameras.md)
-    result: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), tags_std_px * scale.x)
-    if model is not None and model.rig is not None and band in model.rig.mean:
-        min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
-        result["model"] = max(unobserved_error_px(model.rig, band, by_neighbours=False), min_std_px) * scale.x
-    return result
+    std_px: dict[SeedKind, float] = dict.fromkeys(_TAGS, tags_std_px * scales.fixed.x)
+    layout = relative_parallax(band, bands[0])
+    pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, layout=layout)
+    return pair if model is None or model.rig is None or not pair.has_rig_pixels else _with_rig(pair, model.rig)
+
+
+def _with_rig(pair: BandPair, rig: Rig) -> BandPair:
+    """Return the pair with what the rig of the flight tells about it."""
+    field, scale = rig.fields.get(pair.name), pair.scales.fixed
+    pair = replace(pair, field=None if field is None else field.rescaled(scale))
+    if pair.name not in rig.mean:
+        return pair
+    min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
+    std_px = max(unobserved_error_px(rig, pair.name, by_neighbours=False), min_std_px) * scale.x
+    return replace(
+        pair,
+        seed_std_px={**pair.seed_std_px, "model": std_px},
+        is_lens_known=rig.covers(pair.name),
+        relief_std_px=rig.parallax_px.get(pair.name, 0.0) * scale.mean,
+    )
 
 
 def blank_issue(image: Raster, kind: IssueKind) -> Issue:

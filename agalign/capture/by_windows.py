@@ -72,6 +72,7 @@ def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
         pair.fixed.size_px,
         _is_consistent,
         pair.lens_std_px,
+        max_moved_px=min(_MAX_MOVED_PX, pair.max_shift_px),
     )
     if fitted is None:
         return None
@@ -93,13 +94,13 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def is_extrapolated(plane: Candidate) -> bool:
-    """Return True for a homography that is only inaccurate, without windows in a quarter of the image."""
-    pair = plane.pair
-    if [issue.kind for issue in plane.issues] != [INACCURATE]:
+def is_extrapolated(candidate: Candidate) -> bool:
+    """Return True for a mapping that is only inaccurate, without windows in a quarter of the image."""
+    pair = candidate.pair
+    if [issue.kind for issue in candidate.issues] != [INACCURATE]:
         return False
-    in_frame_px = points_in_frame(plane.mapping, *pair.sizes_px)
-    unobserved = unobserved_quarters(plane.residual.measured_px, pair.fixed.size_px, in_frame_px)
+    in_frame_px = points_in_frame(candidate.mapping, *pair.sizes_px)
+    unobserved = unobserved_quarters(candidate.residual.measured_px, pair.fixed.size_px, in_frame_px)
     return not pair.is_georeferenced and bool(unobserved)
 
 

@@ -183,7 +183,7 @@ class RefinedBand:
         """Yield the homography, then the same with a displacement field if that passes too.
 
         A field is fitted if parallax may cause all issues of the homography, or if there are none and no rig contains
-        the distortion of the lenses; always with `use` "always", not with "never".
+        the distortion of the lenses; with `use` "always" also if one does, with "never" not at all.
         """
         band = self._unchanged_if_aligned
         joint, verified = band.joint, band.verified
@@ -223,7 +223,7 @@ class RefinedBand:
 
 def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
     """Yield the homography with the p95 of both geometries, then the same with a displacement field, verified by
-    windows that it is not fitted to; without it if it does not reduce their shifts, or if only the homography passes.
+    windows that it is not fitted to; without it if it increases their shifts, or if only the homography passes.
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)

@@ -24,12 +24,15 @@ from agalign.fit.window_fit import WindowFit, fit_windows
 from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
+from agalign.values.capture import Capture
 from agalign.values.least_squares import Robust, least_squares
 from agalign.values.residual import Residual
 
 
-def with_map_estimates(bands: Sequence[RefinedBand], rig: Rig | None) -> list[RefinedBand]:
-    """Return the bands of a capture with the MAP estimates of all windows, and with those of each half of them.
+def with_map_estimates(
+    bands: Sequence[RefinedBand], rig: Rig | None, capture: Capture | None = None
+) -> list[RefinedBand]:
+    """Return the bands of a `capture` with the MAP estimates of all windows, and with those of each half of them.
 
     The windows of a band are ignored, also in its halves, if all together are too few or their correction is too large.
     Bands without a covariance have their result.
@@ -40,7 +43,7 @@ def with_map_estimates(bands: Sequence[RefinedBand], rig: Rig | None) -> list[Re
     fits, *of_halves = ([_fit(b, r) for b, r in zip(bands, some, strict=True)] for some in (residuals, *halves))
     is_used = [fit is not None and fit.max_px <= max_correction_px for fit in fits]
     estimates, black, white = (
-        _estimates(bands, [fit if used else None for fit, used in zip(some, is_used, strict=True)], rig)
+        _estimates(bands, [fit if used else None for fit, used in zip(some, is_used, strict=True)], rig, capture)
         for some in (fits, *of_halves)
     )
     return [
@@ -56,7 +59,9 @@ def _fit(band: RefinedBand, residual: Residual) -> WindowFit | None:
     return fit_windows(band.pair.mapping(band.joint.fixed_to_moving), residual, band.pair.fixed.size_px)
 
 
-def _estimates(bands: Sequence[RefinedBand], fits: Sequence[WindowFit | None], rig: Rig | None) -> list[JointResult]:
+def _estimates(
+    bands: Sequence[RefinedBand], fits: Sequence[WindowFit | None], rig: Rig | None, capture: Capture | None
+) -> list[JointResult]:
     """Return the estimates of bands with fits to their windows, or without them."""
     pairs = [band.pair for band in bands]
     estimates = {
@@ -65,7 +70,7 @@ def _estimates(bands: Sequence[RefinedBand], fits: Sequence[WindowFit | None], r
     }
     if rig is not None:
         by_images = {name: joint for name, joint in estimates.items() if joint.corner_covariance_px2 is not None}
-        known = observation(pairs, by_images)
+        known = observation(pairs, by_images, capture)
         for pair in pairs:
             if pair.name in known.mappings and pair.name in rig.mean:
                 estimates[pair.name] = _with_prior(pair, by_images[pair.name], rig_prediction(pair, rig, known))

@@ -92,15 +92,13 @@ def seed_to_use(pair: BandPair, found: Seed | Issue, *, is_asked_for: bool = Fal
     """Return the seed that was found; that of tags or flight if there is none, or if it contradicts them and the user
     did not ask for it.
     """
-    matrices, std_px = pair.seed_matrices, pair.seed_std_px
+    expected = pair.expected_kind
     if isinstance(found, Issue):
-        kind, matrix = next(iter(matrices.items()))
+        kind, matrix = next(iter(pair.seed_matrices.items()))
         return Seed(kind, matrix, 0.0)
-    # The smallest standard error; of equal ones, the first in order of preference.
-    known = min((kind for kind in matrices if kind in std_px), key=std_px.__getitem__, default=None)
-    if known is None or is_asked_for or pair.is_expected(found.fixed_to_moving):
+    if expected is None or is_asked_for or pair.is_expected(found.fixed_to_moving):
         return found
-    return Seed(known, matrices[known], 0.0, trusted=True)
+    return Seed(expected, pair.seed_matrices[expected], 0.0, trusted=True)
 
 
 def corrected(pair: BandPair, seed: Seed) -> Seed | None:

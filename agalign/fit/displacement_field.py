@@ -50,7 +50,7 @@ _FOLDS = 4
 
 @dataclass(frozen=True)
 class DisplacementResult:
-    """A displacement field, and its effect on the residual of held-out windows; no field if it increases that."""
+    """A displacement field, and its effect on the residual of held-out windows; no field if that grows too much."""
 
     field: DisplacementField | None
     before_p95_px: float
@@ -78,7 +78,7 @@ class DisplacementEstimator:
 
         The shifts are measured again with the field of each round until their median is at most 0.2 px, as correlation
         is sharper and large shifts are measured in steps. Returns no field if it folds the image or increases the p95
-        of held-out windows; None if too few windows are measured.
+        of held-out windows beyond _MAX_P95_GROWTH; None if too few windows are measured.
         """
         field = None if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
         max_rounds, converged_px = 4, 0.2

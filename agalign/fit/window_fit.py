@@ -74,7 +74,7 @@ class WindowFit:
     corners_px: Array
     """(8,) displacements x and y of the corners in turn, clockwise from the top left."""
     residuals_px: Array
-    """(n,) lengths of the residuals of the windows; NaN where not measured."""
+    """(n,) lengths of the residuals: of the measured windows by `fit_windows`, of all with NaN by `adjust`."""
     size_px: tuple[int, int]
     covariance_px2: Array
     """(8, 8), or (12, 12) with the lens shapes."""

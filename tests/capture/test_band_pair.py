@@ -10,7 +10,7 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import discover
-from agalign.capture.band_pair import _seed_std_px, read_pairs
+from agalign.capture.band_pair import _with_rig, read_pairs
 from agalign.capture.by_rig import observed
 from agalign.capture.full_resolution import is_worth_refining
 from agalign.capture.reference import longest_for
@@ -167,8 +167,32 @@ def test_the_error_of_a_rig_is_converted_to_px_of_the_fixed_image() -> None:
     captures = (CaptureFactors(None, None, None, (0.0,) * 5),) * 3
     mean, baselines = {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}
     rig = Rig((800, 600), mean, baselines, {"LWIR": 0.0}, {}, (), captures, {"LWIR": 5.0})
-    model = FlightModel(None, None, ("LWIR",), {}, "", rig)
-    assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(5.0 * 0.5)
+    image = whole(np.zeros((300, 400), np.float32))
+    pair = replace(pair_of(image, image), name="LWIR", scales=PairScales(PixelScale(0.5, 0.5), SAME_PIXELS))
+    assert _with_rig(pair, rig).seed_std_px["model"] == pytest.approx(5.0 * 0.5)
+
+
+def test_a_mapping_that_agrees_with_tags_and_not_with_the_more_certain_rig_is_not_expected() -> None:
+    """In a repetitive scene, the next row may be within the error of the tags."""
+    image, tags, of_rig = whole(np.zeros((300, 400), np.float32)), geometry.translation(10.0, 0.0), np.eye(3)
+    pair = pair_of(image, image, {"model": of_rig, "rig": tags}, rig=5.0, model=1.0)
+    assert pair.is_expected(geometry.translation(2.0, 0.0))
+    assert not pair.is_expected(geometry.translation(14.0, 0.0))
+    assert pair_of(image, image, {"rig": tags}, rig=5.0).is_expected(geometry.translation(14.0, 0.0))
+
+
+def test_a_band_without_the_lens_of_the_others_has_no_rig(flight: Path) -> None:
+    """Mapping, error and lens of the rig are those between undistorted pixels."""
+    capture = discover(flight).captures[0]
+    bands = [replace(b, lens=None) if b.name == "NIR" else b for b in capture.bands]
+    names = [b.name for b in capture.moving]
+    mean, values = dict.fromkeys(names, np.eye(3)), dict.fromkeys(names, 0.3)
+    factors = (CaptureFactors(None, None, None, (0.0,) * 5),) * 3
+    rig = Rig(capture.reference.size_px, mean, dict.fromkeys(names, (1.0, 0.0)), values, {}, (), factors, values)
+    pairs, _ = read_pairs(
+        replace(capture, bands=tuple(bands)), SeedSettings(), FlightModel(None, None, (), {}, "", rig)
+    )
+    assert {p.name for p in pairs if not p.has_rig} == {"NIR"}
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])

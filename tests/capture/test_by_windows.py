@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 import agalign
+from agalign.capture import align_bands
 from agalign.capture import by_windows as module
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_windows import is_extrapolated
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
 from agalign.capture.reference import Reference
 from agalign.capture.seeding import find_seed
+from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
@@ -66,6 +68,18 @@ def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, m
     assert len(aligned_already.candidates) == 1
     monkeypatch.setattr(module, "_MAX_MOVED_PX", 0.5)  # less than the error of the seed
     assert fitted_to_windows(lost(pair)).status == "seed_only"
+
+
+@pytest.mark.parametrize(("std_px", "is_fitted"), [(0.6, False), (4.0, True)])
+def test_windows_are_fitted_where_descriptors_predict_with_an_error_that_no_index_accepts(
+    pair: BandPair, std_px: float, is_fitted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted: list[BandCandidates] = []
+    monkeypatch.setattr(align_bands, "fitted_to_windows", fitted.append)
+    warped = WarpedPair.of(pair, pair.mapping(TRUTH))
+    band = BandCandidates(pair, SEED, candidates=[Candidate.of(warped, joint_result(TRUTH, std_px=std_px))])
+    assert fitted_to_windows(band).status == "predicted"
+    assert bool(fitted) is is_fitted
 
 
 def test_held_out_windows_must_confirm_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,6 +285,15 @@ def test_a_coarse_band_has_the_error_of_the_relief_of_its_flight(scene: np.ndarr
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
     over_trees = replace(band.pair, relief_std_px=3.0)
     assert module.in_windows_that_agree(BandCandidates(over_trees, band.seed)).error.relief_std_px == 3.0
+
+
+def test_a_coarse_band_is_not_predicted_far_from_its_seed(scene: np.ndarray) -> None:
+    """Its windows may agree with the next row of plants."""
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
+    for off_px, is_predicted in ((0.0, True), (10.0, True), (20.0, False)):
+        off = geometry.compose(band.seed.fixed_to_moving, geometry.translation(off_px, 0.0))
+        by_windows = module.in_windows_that_agree(BandCandidates(band.pair, replace(band.seed, fixed_to_moving=off)))
+        assert (by_windows is not None) is is_predicted
 
 
 def test_areas_without_data_do_not_count_in_a_georeferenced_coarse_band(scene: np.ndarray) -> None:

@@ -132,6 +132,14 @@ def displaced_pair(height_px: float, wavelength_px: float | None = None) -> Band
     return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
 
 
+def test_a_band_that_descriptors_do_not_align_where_the_tags_contradict_is_tried_at_the_tags() -> None:
+    far = replace(CENTRED, kind="structure", fixed_to_moving=geometry.translation(90.0, 0.0))
+    band = BandCandidates(replace(displaced_pair(0.0), seed_std_px={"rig": 5.0}), far)
+    other = estimation_of(band)._other_seed(band)
+    assert other == band.start
+    assert other.kind == "rig"
+
+
 @pytest.mark.parametrize("later", [Issue(RETRIEVAL, 0.0, 0.2), joint_result(retrieval=0.05)])
 def test_a_later_optimisation_that_retrieves_nothing_does_not_replace_an_earlier_one(
     later: JointResult | Issue,

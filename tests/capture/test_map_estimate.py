@@ -1,18 +1,22 @@
 """MAP estimates of a capture from its images and the flight's rig."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from agalign.capture import map_estimate
 from agalign.capture.band_pair import BandPair
+from agalign.capture.by_rig import observation
 from agalign.capture.candidate import RefinedBand
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.warped_pair import WarpedPair
-from agalign.flight.rig import Rig
+from agalign.flight.rig import Observation, Rig
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
+from agalign.values.capture import Capture
 from agalign.values.residual import Residual
 
 from ..builders import joint_result, pair_of, residual_of, two_views, whole
@@ -55,6 +59,19 @@ def band(pair: BandPair, joint: JointResult, windows: Residual = NOTHING) -> Ref
 def found_together(red: JointResult, nir: JointResult, the_rig: Rig | None) -> dict[str, JointResult]:
     bands = [band(pair, joint) for pair, joint in zip(pairs(), (red, nir), strict=True)]
     return {b.pair.name: b.joint for b in with_map_estimates(bands, the_rig)}
+
+
+def test_the_prior_of_a_band_is_by_time_and_altitude_of_its_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def observed(*known: object) -> Observation:
+        seen.append(known[-1])
+        return observation(*known[:2])
+
+    monkeypatch.setattr(map_estimate, "observation", observed)
+    capture = Capture("one", Path(), (), 0)
+    with_map_estimates([band(pairs()[0], result(0.0, 1.0))], rig(), capture)
+    assert seen == [capture] * 3  # by all windows, and by each half
 
 
 def test_corners_without_texture_follow_the_rig_with_its_error() -> None:
