@@ -190,17 +190,12 @@ class CaptureEstimation:
 
         seeds = {name: seed for name, seed in self.seeds.items() if name in sides}
         results = self._optimised(seeds, refined, sides)
-        lost = [self.bands[name] for name in seeds if not is_retrieved(results[name])]
-        again = {band.pair.name: seed for band in lost if (seed := self._other_seed(band)) is not None}
-        others = self._optimised(again, refined, sides)
-        self.add(results | {name: result for name, result in others.items() if is_retrieved(result)})
-
-    def _other_seed(self, band: BandCandidates) -> Seed | None:
-        """Return another seed for a band that the descriptors do not align at the one that was found: that of tags or
-        flight if these contradict it, else the same corrected by windows, as tags may have the wrong scale.
-        """
-        assert isinstance(band.seed, Seed)
-        return corrected(band.pair, band.seed) if band.start is band.seed else band.start
+        for other_seed in (_corrected, _contradicting):
+            lost = [self.bands[name] for name in seeds if not is_retrieved(results[name])]
+            again = {band.pair.name: seed for band in lost if (seed := other_seed(band)) is not None}
+            others = self._optimised(again, refined, sides)
+            results |= {name: result for name, result in others.items() if is_retrieved(result)}
+        self.add(results)
 
     def _learn(self, capture: Capture | None, *, relearn: bool) -> Alignments:
         """Align bands with networks that are learned on the capture alone; return the alignments then."""
@@ -314,6 +309,17 @@ class CaptureEstimation:
     def _may_be_homography(self) -> bool:
         """False if the user chose a model family with fewer parameters."""
         return self.settings.joint.model_family in ("auto", "homography")
+
+
+def _corrected(band: BandCandidates) -> Seed | None:
+    """Return the seed that windows correct, as tags may have the wrong scale; None if they do not."""
+    assert isinstance(band.seed, Seed)
+    return corrected(band.pair, band.seed)
+
+
+def _contradicting(band: BandCandidates) -> Seed | None:
+    """Return the seed of tags or flight if it contradicts the one that was found; None if it does not."""
+    return None if band.start is band.seed else band.start
 
 
 def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None, capture: Capture | None) -> set[str]:

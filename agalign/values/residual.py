@@ -114,27 +114,20 @@ class Residual:
         """Standard error estimated from the windows, px: their RMS shift beyond the noise of their peaks; infinite
         without any.
 
-        At least half of the RMS is kept, because the noise is known only to a factor.
-        """
-        if not len(self.lengths_px):
-            return math.inf
-        noise_of_peaks_px = self._quantile(noise_px(self.peaks_sigma[self.is_measured]), 0.5)
-        return math.sqrt(max(self.rms_px**2 - noise_of_peaks_px**2, (self.rms_px / 2) ** 2))
-
-    @cached_property
-    def rms_px(self) -> float:
-        """RMS length of the measured shifts, without wrong peaks, px; infinite without any.
-
         A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
-        distribution with the same median, and with the same 80th percentile. Windows are weighted by their noise.
+        distribution with the same median, and with the same 80th percentile. Windows are weighted by their noise. At
+        least half of the RMS is kept, because the noise is known only to a factor.
         """
         if not len(self.lengths_px):
             return math.inf
-        # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
-        return max(self._quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
+        noise, weights = noise_px(self.peaks_sigma[self.is_measured]), square_weights(self)
 
-    def _quantile(self, values: NDArray[np.float64], p: float) -> float:
-        return float(np.quantile(values, p, weights=square_weights(self), method="inverted_cdf"))
+        def quantile(values: NDArray[np.float64], p: float) -> float:
+            return float(np.quantile(values, p, weights=weights, method="inverted_cdf"))
+
+        # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
+        rms_px = max(quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
+        return math.sqrt(max(rms_px**2 - quantile(noise, 0.5) ** 2, (rms_px / 2) ** 2))
 
     @property
     def is_even_cell(self) -> NDArray[np.bool_]:

@@ -6,11 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agalign.capture import align_bands
 from agalign.capture import candidate as module
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import BandCandidates, RefinedBand, mapping_error
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
+from agalign.flight.model import FlightModel
+from agalign.method.descriptor import Descriptor
+from agalign.method.joint import Results
+from agalign.method.state import ImageGroup
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import ReliefUse
@@ -132,12 +137,22 @@ def displaced_pair(height_px: float, wavelength_px: float | None = None) -> Band
     return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
 
 
-def test_a_band_that_descriptors_do_not_align_where_the_tags_contradict_is_tried_at_the_tags() -> None:
+def test_a_band_that_descriptors_do_not_align_where_the_tags_contradict_is_tried_at_the_tags(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     far = replace(CENTRED, kind="structure", fixed_to_moving=geometry.translation(90.0, 0.0))
     band = BandCandidates(replace(displaced_pair(0.0), seed_std_px={"rig": 5.0}), far)
-    other = estimation_of(band)._other_seed(band)
-    assert other == band.start
-    assert other.kind == "rig"
+    tried: list[float] = []
+
+    def refined(net: Descriptor, group: ImageGroup, *_: object) -> Results:
+        tried.append(group.moving[0].fixed_to_moving[0, 2])
+        return {"moving": Issue(RETRIEVAL, 0.0, 0.2)}
+
+    monkeypatch.setattr(align_bands, "refine_with", refined)
+    monkeypatch.setattr(align_bands, "corrected", lambda *_: None)
+    model = FlightModel(None, None, ("reference", "moving"), {}, "")
+    replace(estimation_of(band), model=model)._refine()
+    assert tried == [90.0, 0.0]
 
 
 @pytest.mark.parametrize("later", [Issue(RETRIEVAL, 0.0, 0.2), joint_result(retrieval=0.05)])

@@ -191,16 +191,6 @@ def test_the_error_between_images_is_that_between_files(sigma: float) -> None:
     np.testing.assert_allclose(between_files.error_px(2 * points + 0.5), expected, rtol=0.01)
 
 
-def test_windows_limit_lens_shapes_by_all_their_shift_and_not_by_that_beyond_their_noise() -> None:
-    """Shifts that are noise do not exclude shapes of this length."""
-    far, std_px = (620.0, 240.0), []
-    for sigma in (1000.0, 10.0):  # without noise, and with more than the windows are shifted
-        windows = replace(columns(4), peaks_sigma=np.full(columns(4).peaks_sigma.shape, sigma))
-        error = replace(error_of([0.01] * 4, windows), lens_std_px=lens_std_px(SIZE, calibrated=False))
-        std_px.append(error.distortion_px(np.array([far])))
-    assert std_px[0] == pytest.approx(std_px[1], rel=1e-3)
-
-
 def test_windows_with_much_noise_say_little_of_the_error() -> None:
     """Their noise is known only to a factor, here to 1.4. They overlap, as under a relief."""
     rng = np.random.default_rng(0)
