@@ -239,7 +239,7 @@ def _changed_options(
 def _has_indices(earlier: Sidecar, names: Sequence[str]) -> bool:
     """Return True if all indices were requested before, or exist."""
     files = {part.file for part in earlier.products if part.kind == "index"}
-    requested = (earlier.options or {}).get("write", {}).get("indices", [])
+    requested = earlier.write_options.get("indices", [])
     return all(name in requested or f"{earlier.capture}_{name}.tif" in files for name in names)
 
 
