@@ -144,7 +144,8 @@ def _onto(
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
     Grids, resolutions and coordinate reference systems may differ. A mosaic is aligned if its expected error is at
-    most half a pixel of REFERENCE in 90% of the image. Its output has the band of REFERENCE (--band), then its own.
+    most half a pixel of REFERENCE in 90% of the common area. Its output has the band of REFERENCE (--band), then its
+    own.
 
     Options:
         reference: The mosaic with the output grid.
