@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from agalign.batch.capture_report import CaptureReport
-from agalign.batch.output_files import earlier_result, is_removed, refuse_to_overwrite
+from agalign.batch.output_files import earlier_result, is_removed, refuse_to_overwrite, remove_files
 from agalign.batch.products import PRODUCTS
 from agalign.batch.render import render
 from agalign.batch.workers import failure_text
@@ -159,8 +159,7 @@ def estimate(
         facts |= {"products": earlier.products, "options": joined_options(result.options, earlier.options)}
     written = write_sidecar(paths.sidecar, result.model_copy(update=facts))
     if relief is None and is_removed(path, {}):
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+        remove_files([path], out)
     # Their mappings have the decimals of the file, and hold the positions of all pixels.
     return written, written.alignments({name: alignment.mapping for name, alignment in alignments.items()})
 

@@ -1,7 +1,8 @@
 """Spectral indices of all captures of a run: serially, in processes of this machine, or on an executor."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,17 +10,18 @@ import cv2
 
 from agalign.batch.capture_task import quiet
 from agalign.batch.workers import failure_text, numbers_of_workers, open_workers, serially
-from agalign.errors import AgalignError, ConfigurationError
+from agalign.errors import AgalignError, ConfigurationError, SidecarError
 from agalign.host.files import REPORT_FILE, written_below
+from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.processes import usable_cores
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import counted_sidecars
-from agalign.records.sidecar_file import add_products, label_of, read_checked, run_sidecars
+from agalign.records.sidecar_file import add_products, label_of, read_checked, read_sidecar, run_sidecars
 from agalign.spectral_indices.formulas import Index
 from agalign.spectral_indices.indices_csv import refuse_foreign_table, to_check, update_table
-from agalign.spectral_indices.rasters import IndexRasters, IndexReport, write_rasters
+from agalign.spectral_indices.rasters import IndexRasters, IndexReport, index_rasters, write_rasters
 
 
 @dataclass(frozen=True)
@@ -54,17 +56,34 @@ def index_tasks(
     out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run, and ConfigurationError
-    without indices, or if another folder is the target and has a table that no command has written.
+    without indices, or if the target has a table or page that no command has written, or an index of another flight.
     """
     if not indices:
         raise ConfigurationError("no index is given; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
     if target.resolve() == out.resolve():
         target = out  # also if it is spelled differently, or is a link
+        refuse_foreign_pages(out)
     else:
         refuse_foreign_table(target)
     sidecars = counted_sidecars(run_sidecars(out), out)
     task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, RunFacts.of(out))
-    return [replace(task, sidecar=path, file_states=states) for path, states in sidecars.items()]
+    tasks = [replace(task, sidecar=path, file_states=states) for path, states in sidecars.items()]
+    if target != out and target.is_dir():
+        _refuse_indices_of_others(tasks)
+    return tasks
+
+
+def _refuse_indices_of_others(tasks: Sequence[IndexTask]) -> None:
+    """Raise ConfigurationError for an index raster of another capture with the label of a task: cameras give the
+    captures of each flight the same names.
+    """
+    for task in tasks:
+        for raster in index_rasters(task.target / task.label):
+            with suppress(SidecarError):  # reported when its task is done
+                places = (band.place for band in read_sidecar(task.sidecar).bands if band.place is not None)
+                files = {task.sidecar.parent / place.file for place in places}
+                if any(map(raster.is_of_other, files)):
+                    raise ConfigurationError(f"{raster.path}: is of another flight; choose another folder with -o")
 
 
 def run_indices(
@@ -72,7 +91,7 @@ def run_indices(
     jobs: int = 0,
     executor: Executor | None = None,
     on_problem: Callable[[str], object] = quiet,
-) -> Iterator[list[IndexReport]]:
+) -> Generator[list[IndexReport], None, None]:
     """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv, and the
     pages of the run if they are in the same folder. Files that are not in the pages are reported to `on_problem`.
 

@@ -20,15 +20,15 @@ from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
 from agalign.flight.fingerprint import input_samples
-from agalign.host.files import PAGES, RUN_FILE, check_inside, max_name_bytes, remove_companions
-from agalign.host.own_files import foreign, is_own_file, refuse_foreign
+from agalign.host.files import check_inside, max_name_bytes, remove_companions
+from agalign.host.own_files import foreign, is_own_file, refuse_foreign, refuse_foreign_pages
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
 from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES
 from agalign.records.run_record import file_states
 from agalign.records.sidecar import FilePart, Sidecar
-from agalign.records.sidecar_file import OtherSchemaError, find_sidecars, is_sidecar, read_with_change
+from agalign.records.sidecar_file import OtherSchemaError, is_sidecar, read_with_change
 from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.capture import Capture, CaptureTime
 
@@ -198,17 +198,11 @@ def refuse_results_elsewhere(captures: Sequence[Capture], out: Path, read: ReadS
             raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")
 
 
-def refuse_foreign_pages(out: Path) -> None:
-    """Raise ConfigurationError for a file with the name of that of panels or sky that no run wrote, and if a folder
-    without record and results of a run has files with the names of its pages.
-    """
+def refuse_foreign_files_of_runs(out: Path) -> None:
+    """Raise ConfigurationError for a file with the name of a page, or of that of panels or sky, that no run wrote."""
     for name, start in PANEL_AND_SKY_FILES.items():
         refuse_foreign(out / name, (start,))
-    if (out / RUN_FILE).exists() or find_sidecars(out):
-        return
-    for path in (out / name for name in PAGES):
-        if path.is_file():
-            raise ConfigurationError(foreign(path))
+    refuse_foreign_pages(out)
 
 
 # ---- whether a result is of the same capture

@@ -110,10 +110,11 @@ def _demo(
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.host.output_folder import prepare_output
-    from agalign.synthetic.flight import make_flight, score_against_truth
+    from agalign.synthetic.flight import make_flight, refuse_other_images, score_against_truth
 
     source, target = out / "flight", out / "aligned"
     prepare_output(source)
+    refuse_other_images(source)
     terminal.event(
         "make", f"Rendering a synthetic flight: {counted(captures, 'capture')} of 5 bands …", captures=captures
     )

@@ -3,6 +3,7 @@
 import heapq
 import math
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -178,22 +179,23 @@ def _indices(
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
-    dask, problem = given["run"]["executor"], ""
+    dask, problems = given["run"]["executor"], list[str]()
     reports: list[IndexReport] = []
     are_raw = False
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         try:
-            for number, done in enumerate(run_indices(tasks, jobs, executor, terminal.problem), start=1):
-                terminal.check()
-                if not are_raw and (are_raw := any(r.raw_numbers for r in done)):
-                    terminal.problem(RAW_NUMBERS)
-                _print_capture(done, terminal)
-                reports += done
-                show(number, done[0].capture, 0)
+            with closing(run_indices(tasks, jobs, executor, problems.append)) as results:
+                for number, done in enumerate(results, start=1):
+                    terminal.check()
+                    if not are_raw and (are_raw := any(r.raw_numbers for r in done)):
+                        terminal.problem(RAW_NUMBERS)
+                    _print_capture(done, terminal)
+                    reports += done
+                    show(number, done[0].capture, 0)
         except (OutputError, WorkerError) as error:  # the rasters that were reported, and their statistics, exist
-            problem = str(error)
+            problems.append(str(error))
     is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)
-    code = _conclude([one.name for one in chosen], reports, folder, terminal, problem, as_json=as_json)
+    code = _conclude([one.name for one in chosen], reports, folder, terminal, problems, as_json=as_json)
     return ExitCode.PARTIAL if is_unfinished and code == ExitCode.OK else code
 
 
@@ -202,15 +204,15 @@ def _conclude(
     reports: "Sequence[IndexReport]",
     folder: Path,
     terminal: Terminal,
-    problem: str = "",
+    problems: "Sequence[str]" = (),
     *,
     as_json: bool,
 ) -> int:
-    """Print the statistics of all indices, and return the exit code; `problem` says why captures are missing, or the
-    table or the report could not be written.
+    """Print the statistics of all indices, and return the exit code; `problems` say why captures are missing, or what
+    the table or the report lacks.
     """
     written = [r for r in reports if r.path is not None]
-    if problem:
+    for problem in problems:
         terminal.problem(problem)
     if as_json:
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
@@ -223,9 +225,9 @@ def _conclude(
             first = f"{doubtful[0].capture} {doubtful[0].index}: {doubtful[0].problem}"
             rasters = counted(len(doubtful), "raster")
             terminal.problem(f"{rasters} with bands to check (column problem of {INDICES_FILE}), such as {first}")
-        if not problem:
+        if not problems:
             terminal.result(f"Statistics: {folder / INDICES_FILE}")
-    is_complete = len(written) == len(reports) and not problem
+    is_complete = len(written) == len(reports) and not problems
     return ExitCode.NOTHING if not written else ExitCode.OK if is_complete else ExitCode.PARTIAL
 
 

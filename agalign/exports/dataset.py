@@ -139,6 +139,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 def _captures_with_output(folder: Path) -> list[RunCapture]:
     """The captures with rasters, which have one size and the same contents. Raises InputError."""
     captures, left_out = captures_of_run(folder)
+    left_out += [(c.label, "it has no aligned pixels") for c in captures if c.result.output is None]
     alike, differing = like_most([c for c in captures if c.result.output is not None])
     crops = [(c, c.result.output.crop) for c in alike if c.result.output is not None]
     if sizes := differing_from_most({c.label: (f"{crop[2]} x {crop[3]} px",) for c, crop in crops}):
@@ -167,6 +168,8 @@ def import_xarray() -> Any:
 def _dataset(path: Path, listed: ListedFiles, *, masked: bool) -> "xarray.Dataset":
     """The dataset of the capture with the sidecar at `path`, and its files as they are listed there."""
     xr, sidecar, folder = import_xarray(), read_sidecar(path), path.parent
+    if sidecar.output is None:
+        raise InputError(f"{path}: its capture has no aligned pixels; look at the report of the run")
     files: dict[str, xarray.DataArray] = {}
     result = {}
     for band in sidecar.bands:

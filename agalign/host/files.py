@@ -31,8 +31,14 @@ RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
 PANELS_FILE, SKY_FILE, MODELS_FOLDER = "panels.json", "sky.json", "models"
 REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE = "index.html", "summary.csv", "indices.csv", "flight.geojson"
-"""Pages and tables of a run in its output folder."""
-PAGES = REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE
+PAGES = {
+    REPORT_FILE: b'<!doctype html>\n<html lang="en">\n<head>\n'
+    b'<meta charset="utf-8">\n<meta name="generator" content="agalign">',
+    SUMMARY_FILE: b"folder,capture,band,wavelength_nm,status,",
+    INDICES_FILE: b"folder,capture,captured_at,latitude,longitude,index,",
+    FLIGHT_MAP_FILE: b'{"type": "FeatureCollection", "name": "flight", ',
+}
+"""Pages and tables of a run in its output folder, and how each starts."""
 _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
 _MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from agalign.errors import ConfigurationError
-from agalign.host.files import open_regular
+from agalign.host.files import PAGES, open_regular
 
 SOFTWARE = "agalign"
 """Value of the tag Software of every raster."""
@@ -59,6 +59,12 @@ def refuse_foreign(path: Path, text_starts: tuple[bytes, ...] = (), folder: str 
     """Raise ConfigurationError for a file that is not one as `is_own_file`."""
     if path.is_file() and not is_own_file(path, text_starts):
         raise ConfigurationError(foreign(path, folder))
+
+
+def refuse_foreign_pages(out: Path) -> None:
+    """Raise ConfigurationError for a file with the name of a page or table of a run that no command has written."""
+    for name, start in PAGES.items():
+        refuse_foreign(out / name, (start,))
 
 
 def refuse_to_replace(path: Path, mark: bytes | None) -> None:

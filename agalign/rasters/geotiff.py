@@ -200,9 +200,10 @@ def compressed(kind: str, method: Compression = "deflate") -> dict[str, Any]:
 def to_cog(path: Path, compression: str = "deflate") -> None:
     """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
     cog = path.with_name(f"{path.name}.cog")
-    options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
+    # GDAL's default size of blocks; its default compression is not none.
+    options = {"blocksize": 512, "bigtiff": "if_safer", "compress": compression}
     if compression != "none":
-        options |= {"compress": compression, "predictor": "yes"}
+        options["predictor"] = "yes"
     if compression == "zstd":
         options["level"] = _ZSTD_LEVEL
     try:

@@ -58,7 +58,7 @@ class PanSharpened(Product):
         broad = panchromatic(capture)
         if not broad or not {b.name for b in broad} <= {capture.reference.name, *usable}:
             return []
-        fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
+        fine = {"resolution": "finest", "format": "gtiff", "compression": "none", "statistics": False}
         settings = context.settings.write.model_copy(update=fine)
         common = common_grid(capture.reference, settings, context.options.limits)
         layers, grid = output_layers(capture, usable, settings, common, context.read)

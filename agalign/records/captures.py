@@ -39,31 +39,40 @@ def quality_layers(bands: Iterable[str]) -> dict[str, int]:
 def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[AlignedBand]:
     """Return the bands of a capture, given the folder of its sidecar; with `mask_qa` with their quality flags.
 
-    Raises InputError with `mask_qa` if the run wrote no quality raster.
+    Raises InputError with `mask_qa` if the run wrote no quality raster of a capture that has pixels.
     """
     flags = next((part for part in sidecar.products if part.kind == "qa"), None)
-    if mask_qa and flags is None:
+    if mask_qa and flags is None and sidecar.output is not None:
         raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
     checksums = {part.file: part.sha256 for part in sidecar.products}
     result, names = [], [part.band for part in sidecar.bands]
     if sidecar.output is not None:
         names = sidecar.output.bands or names
-    layers = quality_layers(names)
+    layers, lost = quality_layers(names), _why_without_pixels(sidecar)
     for part in sidecar.bands:
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layers[part.band], flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
         problem = ""
-        if part.place is None and part.is_usable(sidecar.accept_predicted_px):
-            problem = f"the pixels of {part.band} were not written; run again"
-        elif not part.is_usable(sidecar.accept_predicted_px):
+        if not part.is_usable(sidecar.accept_predicted_px):
             error = ""
             if part.status == "predicted" and part.error is not None:
                 limit_px = sidecar.accept_predicted_px
                 error = f" with an expected error of {part.error.in_words}, above {limit_px:g} px of the band"
             problem = f"{part.band} is {part.status.replace('_', ' ')}{error} ({part.reason})"
+        elif part.place is None:
+            problem = lost or f"the pixels of {part.band} were not written; run again"
         result.append(AlignedBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result
+
+
+def _why_without_pixels(sidecar: Sidecar) -> str:
+    """Return that a capture has no aligned pixels and why; empty if it has, or should have, some."""
+    moving = (band for band in sidecar.bands if band.status != "reference")
+    if sidecar.output is not None or any(band.is_usable(sidecar.accept_predicted_px) for band in moving):
+        return ""
+    known = (f": {name} is {status.replace('_', ' ')} ({reason})" for name, status, reason in sidecar.pairs if reason)
+    return f"its capture has no aligned pixels{next(known, '')}"
 
 
 @dataclass(frozen=True)

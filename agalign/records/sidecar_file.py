@@ -110,6 +110,8 @@ def place_problem(path: Path, sidecar: Sidecar) -> Reason | None:
 def _contents(path: Path) -> bytes:
     try:
         return read_regular(path, _MAX_BYTES)
+    except FileNotFoundError:
+        raise SidecarError(f"{path}: does not exist; give the sidecar of a capture") from None
     except OSError as error:
         raise SidecarError(f"{path}: cannot be read ({error.strerror or error}); delete it and run again") from None
 

@@ -19,6 +19,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
+from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
@@ -46,8 +47,9 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     sidecars below OUT, and return their data.
 
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
-    Raises OutputError.
+    Raises OutputError, and ConfigurationError for a file with the name of a page that no command has written.
     """
+    refuse_foreign_pages(out)
     unreadable: list[str] = []
     facts, flight_map = FlightFacts(out), FlightMap()
     rows = _add_captures(out, facts, flight_map, unreadable.append)

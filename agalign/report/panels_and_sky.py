@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from agalign.errors import AgalignError
+from agalign.errors import AgalignError, UnreadableFileError
 from agalign.flight.footprint import accuracy_of_footprint_m, footprint
 from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
@@ -100,11 +100,15 @@ def _radiance(band: Band) -> float | None:
 
 
 def _tile(reading: BandReading) -> Picture:
-    """A band with its name, the albedo and the measured area."""
+    """A band with its name, the albedo and the measured area; black if its pixels cannot be read."""
     band = reading.band
     scale = 320 / band.width_px
     size = 320, max(1, round(band.height_px * scale))
-    pixels = read_preview(band.path, band.index_in_page, (0, 0, *band.size_px), size, band.page)
+    title = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
+    try:
+        pixels = read_preview(band.path, band.index_in_page, (0, 0, *band.size_px), size, band.page)
+    except UnreadableFileError:
+        pixels, title = np.full((size[1], size[0]), np.nan), f"{band.name}: cannot be read"
     # A few hot pixels must not determine the contrast.
     low, high = np.nanpercentile(pixels, (1.0, 99.5)) if np.isfinite(pixels).any() else (0.0, 1.0)
     grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255
@@ -112,5 +116,4 @@ def _tile(reading: BandReading) -> Picture:
     if band.panel is not None and band.panel.corners_px:
         corners = PixelScale(scale, scale).positions(band.panel.corners_px).round().astype(np.int32)
         cv2.polylines(image, [corners], isClosed=True, color=(255, 64, 32), thickness=2, lineType=cv2.LINE_AA)
-    title = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
     return titled(image, title, height_px=24)

@@ -42,6 +42,8 @@ from agalign.values.spectrum import role_of_band
 
 PICTURE_PX = 720
 """Longer side of the image at the top left of a picture, which the report overlays on the composite."""
+_OF_CAPTURE = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME"
+"""Tags of a raster that tell of which capture it is."""
 _STATISTICS_TAG = "INDEX_STATISTICS"
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
@@ -334,6 +336,15 @@ class IndexRaster:
             return index_of_formula(f"{self.name}={formula}")
         return None
 
+    def is_of_other(self, bands: Path) -> bool:
+        """Return True if the tags name another capture than those of a file of bands: by the id, else
+        by camera or time.
+        """
+        own, others = self.tags, tags_of(bands)
+        known = [name for name in _OF_CAPTURE if own.get(name) and others.get(name)]
+        decisive = known[:1] if "CAPTURE_ID" in known else known
+        return any(own[name] != others[name] for name in decisive)
+
     @property
     def is_masked(self) -> bool:
         """True if its bands were masked by quality flags."""
@@ -454,7 +465,7 @@ def _formula_text(index: Index) -> str:
 
 def _tags(index: Index, like: OpenRaster, unit: str, source: str, *, is_masked: bool) -> dict[str, str]:
     """The tags of a raster, some of which are those of the file of its first band."""
-    copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
+    copied = *_OF_CAPTURE, "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
     return {k: v for k, v in like.tags().items() if k in copied} | {
         "TIFFTAG_SOFTWARE": SOFTWARE,
         "INDEX": index.name,

@@ -23,6 +23,8 @@ PIXELS_PER_MM = 266.666667
 FOCAL_LENGTH_MM = 5.45
 BLACK_LEVEL, WHITE_LEVEL = 4800.0, 52000.0
 EXPOSURE_S = 1.3e-3
+SOFTWARE = "agalign demo"
+"""Tag Software of the images."""
 VIGNETTING = 0.35
 """Relative decrease of the light from the centre to the corners."""
 _IRRADIANCE = 0.8
@@ -180,7 +182,7 @@ class MicaSenseCamera(CameraSpec):
     def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
         """Write (height, width) pixels and their tags."""
         black = {} if band.sees == "heat" else {50714: short(round(BLACK_LEVEL))}
-        first, xmp = {305: text("agalign demo"), **black}, self._xmp(band, exposure, _pixels_per_mm(pixels))
+        first, xmp = {305: text(SOFTWARE), **black}, self._xmp(band, exposure, _pixels_per_mm(pixels))
         exif = {0x829A: rational(EXPOSURE_S * exposure.shutter), 0x8827: short(100), 0x9290: text("000000")}
         write_tiff(path, pixels, self, band, exposure, xmp, "SY01-0000001-AG", first, exif)
 

@@ -7,15 +7,19 @@ darker than soil in the visible bands and much brighter in the near infrared.
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
+from agalign.errors import ConfigurationError
+from agalign.pixels.raster import suffix_format
 from agalign.records.sidecar_file import find_sidecars, label_of, read_sidecar
 from agalign.synthetic import cameras
 from agalign.synthetic.cameras import REDEDGE, BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
@@ -25,6 +29,7 @@ from agalign.values.geometry import Points
 from agalign.values.mapping import splined
 
 ALTITUDE_M = 22.0, 34.0
+_TRUTH = "truth.json"
 _CAPTURES_PER_GROUND = 4
 """Captures over one painted ground; longer flights have several grounds, one in memory at a time."""
 
@@ -75,6 +80,24 @@ def make_flight(
     return _write_truth(folder, truth)
 
 
+def refuse_other_images(folder: Path) -> None:
+    """Raise ConfigurationError for an image below a folder, or a truth.json without images, that `make_flight` has not
+    written.
+    """
+    images = [path for path in sorted(folder.rglob("*")) if suffix_format(path) and path.is_file()]
+    other = next((path for path in images if not _is_synthetic(path)), None)
+    if other is None and not images and (folder / _TRUTH).exists():
+        other = folder / _TRUTH
+    if other is not None:
+        raise ConfigurationError(f"{other}: was not written by agalign demo; choose another folder")
+
+
+def _is_synthetic(path: Path) -> bool:
+    with suppress(OSError, tifffile.TiffFileError), tifffile.TiffFile(path) as tiff:
+        return bool(tiff.pages.first.tags.valueof("Software") == cameras.SOFTWARE)
+    return False
+
+
 def write_shots(
     folder: Path, shots: Sequence[Shot], size_px: tuple[int, int], camera: CameraSpec, rng: np.random.Generator
 ) -> Path:
@@ -113,7 +136,7 @@ def _write(
 
 
 def _write_truth(folder: Path, truth: dict[str, Any]) -> Path:
-    path = folder / "truth.json"
+    path = folder / _TRUTH
     path.write_text(json.dumps(truth), encoding="utf-8")
     return path
 

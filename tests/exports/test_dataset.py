@@ -52,6 +52,17 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
 
 
 @pytest.mark.parametrize("run", ["stack"], indirect=True)
+def test_a_capture_without_pixels_is_named(run: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(run, tmp_path / "out"))
+    failed = out / "0000SET" / "000" / "IMG_0002.json"
+    change(failed, output=None)
+    with pytest.raises(agalign.InputError, match=r"IMG_0002\.json: its capture has no aligned pixels"):
+        agalign.open_capture(failed)
+    with pytest.warns(UserWarning, match="IMG_0002: left out: it has no aligned pixels"):
+        assert agalign.open_flight(out).sizes["capture"] == 1
+
+
+@pytest.mark.parametrize("run", ["stack"], indirect=True)
 def test_times_of_a_flight_are_in_utc_or_by_the_clock_of_the_camera(run: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(run, tmp_path / "out"))
     moments = "2026-06-21T12:00:00+02:00", "2026-06-21T05:00:00-05:00"

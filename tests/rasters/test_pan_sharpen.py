@@ -59,7 +59,7 @@ def test_the_result_equals_that_of_gdal(tmp_path: Path) -> None:
 @pytest.mark.full
 def test_sharpening_keeps_brightness_and_adds_detail(tmp_path: Path) -> None:
     make_two_headings(tmp_path / "in", 1, (640, 480), camera=ALTUM_PT, line=1, lakes=False)
-    settings = agalign.Settings(write=agalign.WriteSettings(pan_sharpen=True, crop="none"))
+    settings = agalign.Settings(write=agalign.WriteSettings(pan_sharpen=True, crop="none", statistics=True))
     (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)
     assert report.error is None
     folder = tmp_path / "out" / "0000SET" / "000"
@@ -69,6 +69,7 @@ def test_sharpening_keeps_brightness_and_adds_detail(tmp_path: Path) -> None:
         assert sharp.dtypes[0] == "uint16"
         assert sharp.tags(2)["PANSHARPENED"].startswith("weighted Brovey by Panchro")
         assert sharp.tags(4)["wavelength"] == "840"
+        assert not [name for name in sharp.tags(4) if name.startswith("STATISTICS")]  # of the bands before
         before, after = stack.read(2).astype(float), sharp.read(2).astype(float)
     # Of a dark level and light: the light is as much as it was.
     dark = 4800

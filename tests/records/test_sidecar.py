@@ -241,6 +241,19 @@ def test_damage_is_found_by_checksums_and_named(out: Path) -> None:
         problems(out)
 
 
+@pytest.mark.parametrize("mask_qa", [True, False])
+def test_the_bands_of_a_failed_capture_say_why_it_failed(mask_qa: bool) -> None:
+    """Not that pixels of the reference were not written, or that it was aligned without quality flags."""
+    failed = example(bands=[NIR | {"status": "failed", "reason": "it is blank"}], output=None)
+    problems = [band.problem for band in bands_of(failed, Path(), mask_qa=mask_qa)]
+    assert problems == ["NIR is failed (it is blank)", "its capture has no aligned pixels: NIR is failed (it is blank)"]
+
+
+def test_a_sidecar_that_does_not_exist_is_not_to_be_deleted(tmp_path: Path) -> None:
+    with pytest.raises(SidecarError, match=r"IMG_7\.json: does not exist; give the sidecar of a capture"):
+        read_sidecar(tmp_path / "IMG_7.json")
+
+
 def test_seconds_do_not_change_the_checksum() -> None:
     one = {"bands": [{"band": "NIR", "seconds": 1.0}], "seconds": 2.0, "checksum": "x"}
     other = {"seconds": 3.0, "bands": [{"seconds": 4.0, "band": "NIR"}]}

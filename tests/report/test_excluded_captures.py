@@ -19,12 +19,14 @@ from pydantic import ValidationError
 import agalign
 from agalign.config import RunOptions, WriteSettings
 from agalign.errors import ConfigurationError, SidecarError
-from agalign.flight.panel_readings import PanelReading, missing_panel, read_panel, with_panels
+from agalign.flight.panel_readings import BandReading, PanelReading, missing_panel, read_panel, with_panels
 from agalign.host.files import PANELS_FILE, SKY_FILE
 from agalign.host.own_files import is_own_file
 from agalign.records import cautions as run_cautions
 from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES, read_panels_and_sky
 from agalign.report.pages import write_pages
+from agalign.report.panels_and_sky import _tile
+from agalign.values.capture import Band
 
 from ..conftest import SUN, Shared, read_json, seeded
 from ..program import agalign_here
@@ -305,3 +307,13 @@ def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
     problems: list[str] = []
     write_pages(tmp_path, problems.append)
     assert len(problems) == 1
+
+
+def test_the_picture_of_a_panel_with_a_band_that_cannot_be_read_is_drawn(tmp_path: Path) -> None:
+    """The header of the file is complete, its pixels are not; the flight is aligned all the same."""
+    path = tmp_path / "panel.tif"
+    tifffile.imwrite(path, np.zeros((120, 160), np.uint16))
+    band = Band("NIR", path, 1, 160, 120, "uint16")
+    assert _tile(BandReading(band, 0.5)).shape == (264, 320, 3)
+    path.write_bytes(path.read_bytes()[:1000])
+    assert _tile(BandReading(band, 0.5)).shape == (264, 320, 3)

@@ -13,6 +13,7 @@ from synthetic_flights.aligned import make_aligned
 
 import agalign
 from agalign.batch.render import rendered_sidecar
+from agalign.errors import ConfigurationError
 from agalign.flight.footprint import (
     above_elevation,
     accuracy_of_footprint_m,
@@ -135,6 +136,21 @@ def test_index_rasters_of_a_later_command_are_linked_and_stay_linked(tmp_path: P
     assert links() == links() == linked
     (tmp_path / linked[0]).unlink()
     assert links() == linked[1:]
+
+
+def test_a_map_of_the_user_is_neither_replaced_nor_removed(tmp_path: Path) -> None:
+    """By the pages of captures without a position."""
+    mine = tmp_path / "flight.geojson"
+    mine.write_text('{"type": "FeatureCollection", "features": []}')
+    before = mine.read_bytes()
+    with pytest.raises(ConfigurationError, match=r"flight\.geojson: was not written by agalign"):
+        write_pages(tmp_path, lambda _: None)
+    assert mine.read_bytes() == before
+    assert not (tmp_path / "index.html").exists()
+    mine.unlink()
+    make_aligned(tmp_path, 1)
+    for _ in range(2):  # the second time over its own
+        assert [f["id"] for f in features_of_pages(tmp_path)] == ["0000SET/IMG_0001"]
 
 
 def test_captures_of_an_earlier_run_stay_as_long_as_their_sidecars(tmp_path: Path) -> None:

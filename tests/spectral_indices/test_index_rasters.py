@@ -23,7 +23,7 @@ from agalign.rasters.band_reader import RAW
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import FilePart
-from agalign.records.sidecar_file import read_sidecar, verify_outputs, write_sidecar
+from agalign.records.sidecar_file import add_products, read_sidecar, verify_outputs, write_sidecar
 from agalign.report.pages import write_pages
 from agalign.spectral_indices import rasters
 from agalign.spectral_indices.before_alignment import index_before
@@ -274,6 +274,34 @@ def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
     bad, good = indices_of(tmp_path)
     assert "IMG_0001.tif" in bad.problem
     assert good.path is not None
+
+
+def test_the_exit_code_is_3_for_files_that_the_pages_lack(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    picture, sidecar = (tmp_path / "0000SET" / f"IMG_0001.{suffix}" for suffix in ("preview.jpg", "json"))
+    picture.write_bytes(b"x")
+    add_products(sidecar, "picture", [picture])
+    write_pages(tmp_path, lambda _: None)
+    for content, code in ((b"x", 0), (b"y", 3)):
+        picture.write_bytes(content)
+        done = agalign_here("indices", tmp_path)
+        assert ("IMG_0001.preview.jpg: is not what was written" in done.stderr, done.returncode) == (code == 3, code)
+
+
+def test_indices_of_another_flight_are_not_replaced(tmp_path: Path) -> None:
+    """Cameras give the captures of each flight the same names."""
+    for flight, day in (("one", 21), ("two", 22)):
+        make_aligned(tmp_path / flight, 1)
+        with rasterio.open(tmp_path / flight / "0000SET" / "IMG_0001.tif", "r+") as stack:
+            stack.update_tags(TIFFTAG_DATETIME=f"2026:06:{day} 10:00:00")
+        list_stack(tmp_path / flight / "0000SET" / "IMG_0001.json")
+    target = tmp_path / "indices"
+    (report,) = indices_of(tmp_path / "one", target=target)
+    before = report.path.read_bytes()
+    with pytest.raises(ConfigurationError, match=r"IMG_0001_ndvi\.tif: is of another flight; choose another folder"):
+        indices_of(tmp_path / "two", target=target)
+    assert report.path.read_bytes() == before
+    assert indices_of(tmp_path / "one", target=target)[0].kept
 
 
 def test_every_capture_that_failed_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

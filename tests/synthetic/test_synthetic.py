@@ -2,8 +2,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
+import tifffile
 from scipy.spatial.transform import Rotation
 
+from agalign.errors import ConfigurationError
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import paint_ground, reflectance
@@ -54,3 +57,16 @@ def test_captures_of_an_earlier_demo_are_not_scored(flight: Path, aligned_flight
     (tmp_path / "truth.json").write_text(json.dumps({name: of_first}))
     scores = synthetic.score_against_truth(aligned_flight, tmp_path / "truth.json")
     assert {Path(score.capture).name for score in scores} == {name}
+
+
+def test_the_demo_does_not_replace_images_of_the_user(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path, 1, (64, 48))
+    synthetic.refuse_other_images(tmp_path)
+    mine = tmp_path / "0000SET" / "000" / "IMG_0002_1.tif"
+    tifffile.imwrite(mine, np.zeros((48, 64), np.uint16), software="another")
+    with pytest.raises(ConfigurationError, match=r"IMG_0002_1\.tif: was not written by agalign demo"):
+        synthetic.refuse_other_images(tmp_path)
+    for path in mine.parent.iterdir():
+        path.unlink()
+    with pytest.raises(ConfigurationError, match=r"truth\.json: was not written by agalign demo"):
+        synthetic.refuse_other_images(tmp_path)
