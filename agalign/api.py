@@ -27,6 +27,7 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.exports.programs import ExportReport
 from agalign.exports.programs import export as export_run
+from agalign.host.files import written_below
 from agalign.host.output_folder import locked
 from agalign.host.processes import end_if_reimported
 from agalign.pixels.masks import raster_of
@@ -240,7 +241,7 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     if not selection.captures:
         what = "the sky" if selection.sky else "a calibration panel"
         raise InputError(f"{capture.label}: shows {what}; align another capture, or all with align_panels=True")
-    with locked(Path(out)):
+    with locked(Path(out)), written_below(Path(out)):
         refuse_results_elsewhere(selection.captures, Path(out))
         return process_capture(Task(selection.captures[0], Path(out), settings))
 

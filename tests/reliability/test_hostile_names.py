@@ -181,6 +181,9 @@ def test_a_link_in_the_place_of_a_folder_is_not_followed_during_a_run(
     report = next(run)
     run.close()
     assert re.search("out/0000SET/000: a link leads out of", report.error or "")
+    (out / "0000SET").unlink()
+    with pytest.raises(agalign.OutputError, match="out/0000SET/000: a link leads out of"):
+        agalign.align_capture(agalign.discover(flight).captures[0], out, settings=seeded("rig"))
     assert not any(outside.iterdir())
 
 
