@@ -171,22 +171,24 @@ class IndexRasters(Product):
 
     def write(self, context: ProductContext) -> Iterator[WrittenFile | LostFile]:
         """Write the indices that were requested and of which the capture has all bands, usable, and those that an
-        earlier command wrote.
+        earlier command wrote. One that a command has masked by quality flags stays masked if there are flags.
 
         Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
         """
         base, label = context.paths.file(""), context.capture.label
-        requested = chosen_indices(context.settings.write.indices)
-        earlier = [raster for raster in index_rasters(base) if raster.name not in {one.name for one in requested}]
+        requested, rasters = chosen_indices(context.settings.write.indices), index_rasters(base)
+        earlier = [raster for raster in rasters if raster.name not in {one.name for one in requested}]
         if not (requested or earlier):
             return
         bands, problems = list(_bands(context)), []
-        for index, report in zip(requested, write_rasters(bands, requested, base, label), strict=True):
+        masked = list(_masked(bands, context))
+        stay_masked = {raster.name for raster in rasters if raster.is_masked and any(b.quality for b in masked)}
+        for index in requested:
+            (report,) = write_rasters(masked if index.name in stay_masked else bands, [index], base, label)
             if report.path is not None:
                 yield from self._files(context, index, report)
             elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
                 problems.append(f"{index.name}: {report.problem}")
-        masked = list(_masked(bands, context))
         for raster in earlier:
             if raster.index is None:
                 yield LostFile(raster.path, "its formula is unknown")

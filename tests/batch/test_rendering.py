@@ -19,6 +19,7 @@ from agalign.batch.run import plan_run
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import content_checksum, find_sidecars, read_sidecar, verify_outputs
+from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.fields import POSITION_DECIMALS
@@ -350,6 +351,17 @@ def test_a_sidecar_of_five_bands_is_small(aligned_flight: Path) -> None:
     for path in find_sidecars(aligned_flight):
         assert len(read_sidecar(path).bands) == 5
         assert path.stat().st_size < 150_000
+
+
+def test_an_index_that_a_command_has_masked_stays_masked(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
+    """Also if the run names it, as it did when it computed it without a mask."""
+    out = shutil.copytree(aligned_flight, tmp_path / "out")
+    for options, is_masked in (({}, False), ({"statistics": True}, True)):
+        write = agalign.WriteSettings(qa=True, indices=("ndvi",), **options)
+        agalign.align_folder(flight, out, settings=agalign.Settings(write=write))
+        rasters = [raster for path in find_sidecars(out) for raster in index_rasters(path.with_suffix(""))]
+        assert [raster.is_masked for raster in rasters] == [is_masked] * 2
+        agalign.indices(out, ["ndvi"], mask_qa=True)
 
 
 def test_stacks_of_a_camera_have_the_same_bands_in_the_same_order(flight: Path, tmp_path: Path) -> None:
