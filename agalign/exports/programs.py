@@ -1,10 +1,8 @@
 """Exports of a run for photogrammetry programs: band files in one folder."""
 
-import os
-import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +10,7 @@ from agalign.cameras import pix4d
 from agalign.cameras.image_file import natural_order
 from agalign.cameras.metadata import read_tags
 from agalign.errors import ConfigurationError, InputError, OutputError
-from agalign.host.files import check_inside, file_name, remove_partial_files, scratch_file, write_text
+from agalign.host.files import check_inside, file_name, link_or_copy, remove_partial_files, scratch_file, write_text
 from agalign.host.text import counted
 from agalign.rasters.aligned_files import BandFiles
 from agalign.rasters.band_reader import like_most
@@ -133,11 +131,7 @@ def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *
             source = check_inside(file, out)
             target = images / file_name(file.relative_to(out).as_posix(), taken)
             target.parent.mkdir(parents=True, exist_ok=True)
-            if not copy:
-                with suppress(OSError):  # another disk, or a file system without hard links
-                    os.link(source, target)
-            if not target.exists():
-                shutil.copyfile(source, target)
+            link_or_copy(source, target, copy=copy)
 
 
 def _notes(program: ExportProgram, captures: Sequence[RunCapture], files: Sequence[Path]) -> list[str]:

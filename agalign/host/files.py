@@ -115,6 +115,15 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8", newline="\n")
 
 
+def link_or_copy(source: Path, target: Path, *, copy: bool = False) -> None:
+    """Make a hard link to a file, or a copy where that is not possible or not wanted. Raises OSError."""
+    if not copy:
+        with suppress(OSError):  # another disk, or a file system without hard links
+            os.link(source, target)
+    if not target.exists():
+        shutil.copyfile(source, target)
+
+
 def file_checksum(path: Path) -> str:
     """Return the SHA-256 of an output file as hexadecimal digits. Raises OutputError."""
     try:
