@@ -198,7 +198,7 @@ def refuse_results_elsewhere(captures: Sequence[Capture], out: Path, read: ReadS
             raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")
 
 
-def refuse_foreign_files_of_runs(out: Path) -> None:
+def refuse_foreign_run_files(out: Path) -> None:
     """Raise ConfigurationError for a file with the name of a page, or of that of panels or sky, that no run wrote."""
     for name, start in PANEL_AND_SKY_FILES.items():
         refuse_foreign(out / name, (start,))

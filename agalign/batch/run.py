@@ -244,7 +244,7 @@ class _FlightRun:
         output_files.refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, self.results)
         if earlier is None or earlier.input != input_name(self.flight.folder):  # else the images were moved in it
             output_files.refuse_results_elsewhere(self.flight.captures, self.out, self.results)
-        output_files.refuse_foreign_files_of_runs(self.out)
+        output_files.refuse_foreign_run_files(self.out)
         check_inside(self.out / MODELS_FOLDER, self.out)
 
     def starting_from(self, path: Path) -> Self:
