@@ -151,7 +151,7 @@ class SidecarError(InputError):
     ...     agalign.read_alignment("aligned/IMG_0009.json", "NIR")
     ... except agalign.SidecarError as error:
     ...     print(error)
-    aligned/IMG_0009.json: cannot be read (No such file or directory); delete it and run again
+    aligned/IMG_0009.json: does not exist; give the sidecar of a capture
     """
 
 
