@@ -1,7 +1,8 @@
 """Which of its candidates a band gets, and the status that follows.
 
-An estimator proposes only what it has reason to: a field that its own windows reject is no candidate, nor is a relief
-that fits fewer than half of the bands. `decide` chooses among the proposals. For each band, the first row that applies:
+The estimators leave out what they reject themselves: displacement fields that increase the shifts of held-out windows,
+and reliefs that fit fewer than half of the bands. `decide` chooses among the other candidates. For each band, the first
+row that applies:
 
 | chosen                                    | if                                               | status      |
 |-------------------------------------------|--------------------------------------------------|-------------|

@@ -339,8 +339,8 @@ class IndexRaster:
         return None
 
     def is_of_other(self, bands: Path) -> bool:
-        """Return True if the tags name another capture than those of a file of bands: by the id, else
-        by camera or time.
+        """Return True if this raster and a file of bands are of different captures. Their tags are compared: the id of
+        the capture, or camera and time if one of them has no id.
         """
         own, others = self.tags, tags_of(bands)
         known = [name for name in _OF_CAPTURE if own.get(name) and others.get(name)]
