@@ -193,8 +193,9 @@ class CaptureEstimation:
         for other_seed in (_corrected, _contradicting):
             lost = [self.bands[name] for name in seeds if not is_retrieved(results[name])]
             again = {band.pair.name: seed for band in lost if (seed := other_seed(band)) is not None}
-            others = self._optimised(again, refined, sides)
-            results |= {name: result for name, result in others.items() if is_retrieved(result)}
+            for name, result in self._optimised(again, refined, sides).items():
+                if is_retrieved(result):
+                    results[name], self.bands[name] = result, replace(self.bands[name], seed=again[name])
         self.add(results)
 
     def _learn(self, capture: Capture | None, *, relearn: bool) -> Alignments:
@@ -274,12 +275,11 @@ class CaptureEstimation:
         """
         if not results:
             return
-        seeds = self.seeds
         for name, result in results.items():
             found = self.bands[name]
-            found.issue = result if isinstance(result, Issue) else None
             if found.refined is None or is_retrieved(result) or not found.refined.joint.is_retrieved:
-                found.refined = RefinedBand.of(found.pair, seeds[name], result)
+                found.issue = result if isinstance(result, Issue) else None
+                found.refined = RefinedBand.of(found.pair, found.start, result)
         use = self.settings.relief.use if self._may_be_homography else "never"
         bands = self._combined()
         self.progress(next(iter(results)), "relief", 0.0)  # with the name of the first band
@@ -342,7 +342,7 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig | Non
         is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
         # A seed that replaced one that contradicts it has no score: the images do not confirm it.
         has_common_structure = (alignment.seed.trusted and alignment.seed.score > 0) or is_above_chance
-        return not has_common_structure or predictions[name].of_scene.std_px <= DELIVERED_STD_PX
+        return not has_common_structure or predictions[name].is_delivered
 
     return {name for name in lost if not is_skipped(name)}
 

@@ -119,7 +119,7 @@ class BandPair:
 
     @property
     def windows(self) -> FixedWindows:
-        """The windows that verify an alignment."""
+        """The windows that verify an alignment; `WarpedPair.of` takes small ones where these cover less of it."""
         return self.reference.large_windows if self.is_blurred else self.reference.windows
 
     @property

@@ -39,10 +39,11 @@ from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import BY_WINDOWS, JointResult
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
+from agalign.values.issues import PREDICTED_WITH
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual, decrease_in_standard_errors, lengths_in_common_px
-from agalign.verify.checks import MAX_SHIFT_PX, PREDICTED_WITH
+from agalign.verify.checks import MAX_SHIFT_PX
 
 MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""

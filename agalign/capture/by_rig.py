@@ -37,10 +37,11 @@ class RigPrediction:
     pair: BandPair
     of_plane: Prediction
     """Of the reference plane."""
-    of_scene: Prediction
-    """The same, with the error of the relief of the scene."""
-    parallax: Parallax | None
+    parallax: Parallax | None = None
     """The relief of the capture, with the baseline of the rig."""
+    relief_std_px: float = 0.0
+    """Error by that baseline, or by the relief that the mapping lacks, px of the fixed image; that of the relief itself
+    is in `parallax`."""
 
     @property
     def fixed_to_moving(self) -> Matrix:
@@ -55,10 +56,16 @@ class RigPrediction:
     @cached_property
     def candidate(self) -> Candidate:
         """The predicted mapping; the windows under it say nothing about it, as the band did not pass verification."""
-        std_px = self.of_scene.std_px / self.pair.in_moving_file_px(1.0, self.fixed_to_moving)
+        std_px = math.hypot(self.std_px(self.fixed_to_moving), self.relief_std_px)
         mapping = self._warped.mapping
         error = MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=mapping.parallax)
         return Candidate(self.pair, mapping, error, self._warped.residual)
+
+    @property
+    def is_delivered(self) -> bool:
+        """True if the standard error of the predicted mapping allows its delivery."""
+        std_px = self.pair.in_moving_file_px(self.candidate.std_px, self.fixed_to_moving)
+        return std_px <= DELIVERED_STD_PX
 
     @cached_property
     def rotated(self) -> Matrix | None:
@@ -115,8 +122,7 @@ def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) ->
 
 def rig_prediction(pair: BandPair, rig: Rig, known: Observation) -> RigPrediction:
     """Return the prediction of a band from the `known` bands of the capture, without relief."""
-    prediction = predict_band(rig, pair.name, known)
-    return RigPrediction(pair, prediction, prediction, None)
+    return RigPrediction(pair, predict_band(rig, pair.name, known))
 
 
 def rig_predictions(
@@ -127,16 +133,13 @@ def rig_predictions(
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
     predictions: dict[str, RigPrediction] = {}
     for pair in covered:
-        of_plane = rig_prediction(pair, rig, known)
-        parallax, parallax_std_px = _parallax_by_rig(pair, parallaxes, rig)
-        # The plane of a result, which is compared with the prediction, is not displaced by the relief.
+        parallax, relief_std_px = _parallax_by_rig(pair, parallaxes, rig)
         if parallax is None:  # a homography does not follow the relief that captures of the flight have
-            error_px = rig.parallax_px.get(pair.name, 0.0) * rig.magnification(pair.name)
-        else:
-            error_px = pair.in_moving_file_px(parallax_std_px, of_plane.fixed_to_moving)
-        prediction = of_plane.of_plane
-        of_scene = replace(prediction, std_px=math.hypot(prediction.std_px, error_px))
-        predictions[pair.name] = RigPrediction(pair, prediction, of_scene, parallax)
+            relief_std_px = pair.relief_std_px
+        # The plane of a result, which is compared with the prediction, is not displaced by the relief.
+        predictions[pair.name] = replace(
+            rig_prediction(pair, rig, known), parallax=parallax, relief_std_px=relief_std_px
+        )
     return predictions
 
 

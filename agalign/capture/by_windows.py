@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, result_of_windows
+from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, without_descriptors
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.window_fit import WindowFit, cross_fitted, fit_in_rounds
 from agalign.values import geometry
@@ -52,7 +52,7 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     mapping, fit = fitted.mapping, fitted.fit
     known = band.joint
     retrieval, chance = (0.0, 0.0) if known is None else (known.retrieval, known.chance)
-    joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
+    joint = without_descriptors(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
     return Candidate.of(WarpedPair.of(pair, mapping, start.windows), joint, fitted.held_out)
 

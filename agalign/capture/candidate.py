@@ -16,11 +16,11 @@ from agalign.values.alignment import BY_WINDOWS, JointResult, Seed
 from agalign.values.choices import Geometry, ReliefUse, SeedKind
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
-from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, UNREADABLE, Issue
+from agalign.values.issues import BY_PARALLAX, OTHER_GEOMETRY, PREDICTED_WITH, SEED_ASKED_FOR, UNREADABLE, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
-from agalign.verify.checks import BY_PARALLAX, PREDICTED_WITH, is_unchanged, issues_of, seed_fits
+from agalign.verify.checks import is_unchanged, issues_of, seed_fits
 from agalign.verify.coverage import pixels_in_frame, points_in_frame
 
 
@@ -165,7 +165,7 @@ class RefinedBand:
     @classmethod
     def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "RefinedBand":
         """Measure the windows with the homography of a result, or with the seed if there is none."""
-        joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
+        joint = without_descriptors(seed.fixed_to_moving) if isinstance(result, Issue) else result
         return cls(joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
 
     @property
@@ -241,7 +241,7 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
         yield with_field
 
 
-def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
+def without_descriptors(fixed_to_moving: Matrix) -> JointResult:
     """Return a result without evidence of descriptors, with an infinite standard error."""
     return JointResult(
         fixed_to_moving,
@@ -277,6 +277,11 @@ class BandCandidates:
     def start(self) -> Seed:
         """The seed that is used."""
         return seed_to_use(self.pair, self.seed, is_asked_for=self._is_asked_for)
+
+    def start_of(self, candidate: Candidate) -> Seed:
+        """Return the seed that a candidate was estimated from: descriptors start at the one that was found."""
+        is_by_descriptors = candidate.joint is not None and candidate.joint.recipe != BY_WINDOWS
+        return self.seed if is_by_descriptors and isinstance(self.seed, Seed) else self.start
 
     @cached_property
     def at_start(self) -> WarpedPair | None:

@@ -107,7 +107,7 @@ class _Choice:
             chosen.mapping,
             pair.fixed.size_px,
             self.issues,
-            band.start,
+            band.start_of(chosen),
             joint=band.joint if chosen.joint is None else chosen.joint,
             residual=chosen.residual,
             held_out_p95_px=chosen.p95_by_geometry,
@@ -164,4 +164,4 @@ def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:
     if of_rig.rotated is not None:
         unexpected = Issue(UNEXPECTED_PX, of_rig.distance_px(of_rig.rotated), MAX_UNEXPECTED_PX)
         return _Choice(choice.band, None, (unexpected, *choice.issues), is_seed_refused=True)
-    return replace(choice, candidate=of_rig.candidate, compared=replace(of_rig.of_scene, off_px=off_px))
+    return replace(choice, candidate=of_rig.candidate, compared=replace(of_rig.of_plane, off_px=off_px))

@@ -37,11 +37,18 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 
 
 def is_worth_refining(pair: BandPair, alignment: Alignment) -> bool:
-    """Return True for an aligned band without a relief whose files have many more pixels than the images."""
+    """Return True for an aligned band without a relief whose images lack detail of the files that its result shows.
+
+    A moving file with finer pixels than the reference's is sampled at the reference's, so reducing it to these loses
+    nothing.
+    """
     if alignment.status != "aligned" or alignment.mapping.parallax is not None:
         return False
     max_scale = 0.7  # of the images relative to their files
-    return min(*pair.scales.moving, *(() if pair.is_coarse else pair.scales.fixed)) < max_scale
+    fixed_px = min(pair.scales.fixed)
+    moving_pixels = pair.in_moving_file_px(fixed_px, alignment.fixed_to_moving)  # to one of the reference's file
+    of_moving = min(pair.scales.moving) * max(1.0, moving_pixels)
+    return (of_moving if pair.is_coarse else min(of_moving, fixed_px)) < max_scale
 
 
 def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue | None:

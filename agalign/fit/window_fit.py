@@ -51,6 +51,8 @@ _COMMON_STD_PX = 0.01
 """Error that is common to all windows; their residuals do not contain it."""
 _ALTERNATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
+_MIN_FITTED_WINDOWS = 12
+"""Without a prior: 1.5 times the eight parameters of a homography."""
 _CORNER_STD_PX = 5.0
 """Prior of the displacement of a corner: the error of an extrapolated affine mapping."""
 _NOISE_PX = 0.1
@@ -125,8 +127,7 @@ def fit_windows(
     if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
     raw = Shifts.of(residual)
-    min_windows = 12  # without a prior: 1.5 times the eight parameters of a homography
-    if lens_std_px is None and len(raw.centres_px) < min_windows:
+    if lens_std_px is None and len(raw.centres_px) < _MIN_FITTED_WINDOWS:
         return None
     points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
     shifts_px, std_px, with_shapes = shifted_px - points_px, np.full(8, np.inf), lens_std_px is not None

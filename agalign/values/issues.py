@@ -91,6 +91,11 @@ REPEATS = IssueKind(
     remedies.REPETITIVE,
 )
 
+BY_PARALLAX = frozenset((CLOSE_WINDOWS, CLUSTER, INACCURATE, UNMEASURED))
+"""Kinds of issues that parallax may cause, which a relief or a displacement field removes."""
+PREDICTED_WITH = frozenset((*BY_PARALLAX, OTHER_CONTENT))
+"""Kinds of issues of a mapping that the images confirm, but not everywhere: it predicts, with its standard error."""
+
 KINDS: Mapping[str, IssueKind] = {k.code: k for k in list(globals().values()) if isinstance(k, IssueKind)}
 """Every kind of issue that a sidecar may contain, by code: all that are defined above."""
 

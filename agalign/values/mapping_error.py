@@ -99,9 +99,9 @@ class MappingError:
         """
         z_px2 = np.zeros(len(points_px)) if self.parallax is None else self.parallax.variance_px2(points_px)
         local_px2 = np.maximum(z_px2, np.square(moved_px(self.moved, *points_px.T)))
-        return _error_px(*self.smooth_px2(points_px), local_px2)
+        return _error_px(*self.parts_px2(points_px), local_px2)
 
-    def smooth_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def parts_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the parts (n,) of the square that vary smoothly: all but u, z and m, and u, at points (n, 2)."""
         far = self._far(points_px)
         modelled_px2 = self.rig_std_px**2 + self._covariance_px2(points_px) * (1 + far * (_COMMON_ERROR_FACTOR - 1))
@@ -272,7 +272,7 @@ class ErrorOnGrid:
         """Calculate the nodes of a map; the arguments are the fields."""
         columns, rows = (nodes_along(n) for n in size_px)
         points_px = to_reference(geometry.lattice(*size_px, columns, rows))
-        nodes_px2 = np.reshape(error.smooth_px2(points_px), (2, rows, columns)).astype(np.float32)
+        nodes_px2 = np.reshape(error.parts_px2(points_px), (2, rows, columns)).astype(np.float32)
         return cls(error, size_px, nodes_px2, to_reference, is_along_axes)
 
     def on_tile(self, tile: Tile) -> FloatImage:

@@ -42,6 +42,9 @@ MAX_ALIAS_PEAK = 0.75
 
 _MIN_COMMON_COVERAGE = 0.3
 """Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
+_MIN_VERIFYING_WINDOWS = 12
+"""Held-out windows with a measured shift that verify a result without descriptors: in unrelated images, one in a
+thousand is aligned."""
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
 """`aligned` means an expected error of at most this in this share of the common area; that of a relief counts at the
 windows. If the RMS error is 0.5 px, 2 % of the pixels are off by more than 1 px."""
@@ -57,11 +60,6 @@ _MIN_CLUSTER, _MAX_CLUSTER_SHARE = 5, 0.04
 an issue; both must be reached. Wrong peaks are scattered, windows with parallax are adjacent."""
 _MAX_UNEXPECTED_STD = 5.0
 """Distances from the prediction above MAX_UNEXPECTED_PX are accepted up to this multiple of its standard error."""
-
-BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, INACCURATE, UNMEASURED})
-"""Issues that parallax may cause, which a relief or a displacement field removes."""
-PREDICTED_WITH = frozenset({*BY_PARALLAX, OTHER_CONTENT})
-"""Issues of a mapping that the images confirm, but not everywhere: it is a prediction with its standard error."""
 
 
 def issues_of(
@@ -97,9 +95,7 @@ def _descriptor_issues(joint: JointResult | None, residual: Residual) -> Iterato
     """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows."""
     if joint is None:
         return
-    # With a measured shift, if they are the only evidence: in unrelated images one in a thousand is aligned.
-    min_held_out_windows = 12
-    is_confirmed = joint.recipe == BY_WINDOWS and len(residual.measured_px) >= min_held_out_windows
+    is_confirmed = joint.recipe == BY_WINDOWS and len(residual.measured_px) >= _MIN_VERIFYING_WINDOWS
     if not (joint.is_retrieved or is_confirmed):
         yield Issue(RETRIEVAL, joint.retrieval, joint.min_retrieval)
 
@@ -143,7 +139,7 @@ def _error_issues(error: MappingError, residual: Residual, common_px: Points, pi
     """
     if not len(common_px):
         return
-    errors_px = [np.sqrt(np.sum(error.smooth_px2(common_px), axis=0))]
+    errors_px = [np.sqrt(np.sum(error.parts_px2(common_px), axis=0))]
     if error.parallax is not None and len(residual.centres_px):
         errors_px.append(error.error_px(residual.centres_px))
     share = min(float((px <= _MAX_ERROR_PX * pixel_px).mean()) for px in errors_px)

@@ -30,7 +30,7 @@ from agalign.values.issues import UNREADABLE, Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
-from ..builders import joint_result, pair_of, whole
+from ..builders import joint_result, pair_of, two_views, whole
 from ..conftest import textured_image, write_band
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -149,6 +149,31 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
     ]
     assert 270 < pairs[1].fixed.size_px[0] < 310  # about two pixels per pixel of the thermal band
     assert pairs[1].reference_file_px == (800, 600)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "of_fixed", "of_moving", "is_coarse", "expected"),
+    [
+        (1.0, 1.0, 1.0, False, False),
+        (1.0, 0.5, 1.0, False, True),
+        (1.0, 0.5, 1.0, True, False),
+        (1.0, 1.0, 0.5, False, True),
+        (5.0, 1.0, 0.25, False, False),
+        (5.0, 1.0, 0.1, False, True),
+        (0.2, 1.0, 0.5, False, True),
+    ],
+)
+def test_files_are_worth_refining_if_their_images_lack_detail_of_the_result(
+    pixels: float, of_fixed: float, of_moving: float, is_coarse: bool, expected: bool
+) -> None:
+    """`pixels` is the number of pixels of the moving file along one of the reference's."""
+    scales = PairScales(PixelScale(of_fixed, of_fixed), PixelScale(of_moving, of_moving))
+    pair = replace(pair_of(*two_views(np.eye(3), 200, 160), {}), scales=scales, is_coarse=is_coarse)
+    matrix = scales.between_images(np.diag([pixels, pixels, 1.0]))
+    seed = Seed("identity", matrix, 0.0)
+    assert (
+        is_worth_refining(pair, Alignment(pair.mapping(matrix), (200, 160), (), seed, joint_result(matrix))) == expected
+    )
 
 
 @pytest.mark.parametrize("pixels", [1.0, 0.1])

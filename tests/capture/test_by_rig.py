@@ -28,9 +28,8 @@ from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, Seed
 from agalign.values.capture import Capture
-from agalign.values.issues import RETRIEVAL, Issue
+from agalign.values.issues import CLOSE_WINDOWS, RETRIEVAL, Issue
 from agalign.values.mapping_error import MappingError
-from agalign.verify.checks import CLOSE_WINDOWS
 
 from ..conftest import Shared, read_json
 
@@ -112,10 +111,13 @@ class Estimated:
         bands = {**self.estimation.bands, "NIR": nir}
         return replace(self, estimation=replace(self.estimation, bands=bands, reliefs=reliefs))
 
-    def predicted(self, **of_rig: Any) -> Alignments:
-        """The alignments with predictions of a rig with other facts."""
+    def predicted(self, relief_std_px: float = 0.0, **of_rig: Any) -> Alignments:
+        """The alignments with predictions of a rig with other facts, in a flight with this relief."""
         model = self.estimation.model
-        changed = replace(self.estimation, model=replace(model, rig=replace(model.rig, **of_rig)))
+        bands = {
+            n: replace(b, pair=replace(b.pair, relief_std_px=relief_std_px)) for n, b in self.estimation.bands.items()
+        }
+        changed = replace(self.estimation, bands=bands, model=replace(model, rig=replace(model.rig, **of_rig)))
         return changed.decided(changed._predictions(changed.decided(), self.capture))
 
 
@@ -169,7 +171,7 @@ def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, captures: 
     assert "from the capture's other bands" in (nir.reason or "")
     assert (result["Red"].status, result["Red"].prediction.off_px is None) == ("aligned", False)
     # The prediction of a plane contains the parallax of the flight.
-    with_relief = third.predicted(parallax_px=dict.fromkeys(model.rig.mean, 3.0))["NIR"]
+    with_relief = third.predicted(3.0)["NIR"]
     assert with_relief.prediction.std_px == pytest.approx(np.hypot(nir.prediction.std_px, 3.0), abs=1e-4)
 
 
@@ -197,7 +199,7 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
 def test_an_alignment_that_contradicts_the_rig_is_rejected(first: Estimated, model: FlightModel) -> None:
     """The images match with a shift of one period, which contradicts the other bands, in a flight with relief too."""
     moved = {**model.rig.mean, "NIR": geometry.compose(geometry.translation(25, 0), model.rig.mean["NIR"])}
-    result = first.predicted(mean=moved, parallax_px={"NIR": 10.0})
+    result = first.predicted(10.0, mean=moved)
     assert (result["NIR"].status, result["NIR"].issues[0].code) == ("predicted", "unexpected_px")
     assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
 
@@ -219,14 +221,13 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
     """A plane does not contain the parallax of the flight."""
     seed = replace(first.estimation.bands["NIR"].start, trusted=True)
     lost = first.with_nir(issue=Issue(RETRIEVAL, 0.1, 0.2), seed=seed).estimation.decided()
-    for parallax_px, names in ({}, set()), ({"NIR": 10.0}, {"NIR"}):
-        rig = replace(model.rig, parallax_px=parallax_px)
-        assert bands_to_learn(first.pairs, lost, rig, first.capture) == names
+    in_relief = [replace(pair, relief_std_px=10.0) for pair in first.pairs]
+    for pairs, names in (first.pairs, set()), (in_relief, {"NIR"}):
+        assert bands_to_learn(pairs, lost, model.rig, first.capture) == names
     # The seed of the tags replaced a chance peak, as over water: nothing in the images can be learned.
     replaced = first.with_nir(issue=Issue(RETRIEVAL, 0.0, 0.2), seed=replace(seed, score=0.0)).estimation.decided()
-    rig = replace(model.rig, parallax_px={"NIR": 10.0})
     of_chance = replace(replaced["NIR"], joint=None)
-    assert bands_to_learn(first.pairs, {**replaced, "NIR": of_chance}, rig, first.capture) == set()
+    assert bands_to_learn(in_relief, {**replaced, "NIR": of_chance}, model.rig, first.capture) == set()
 
 
 @pytest.mark.full

@@ -15,14 +15,21 @@ from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
 from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Prediction, Seed
+from agalign.values.alignment import BY_WINDOWS, Alignment, Prediction, Seed
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
-from agalign.values.issues import FEW_KEYPOINTS, OTHER_CONTENT, RETRIEVAL, SEED_ASKED_FOR, SEED_DOES_NOT_FIT, Issue
+from agalign.values.issues import (
+    CLOSE_WINDOWS,
+    FEW_KEYPOINTS,
+    OTHER_CONTENT,
+    RETRIEVAL,
+    SEED_ASKED_FOR,
+    SEED_DOES_NOT_FIT,
+    Issue,
+)
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.residual import Residual
-from agalign.verify.checks import CLOSE_WINDOWS
 from agalign.verify.coverage import pixels_in_frame
 
 from ..builders import decided, joint_result, pair_of, residual_of, rms, two_views
@@ -82,7 +89,7 @@ def rig_prediction(
 ) -> RigPrediction:
     """A prediction by the rig, and what landmarks find of an image that is rotated relative to it."""
     prediction = Prediction(matrix, "bands", std_px)
-    result = RigPrediction(of or pair(), prediction, prediction, None)
+    result = RigPrediction(of or pair(), prediction)
     vars(result)["rotated"] = rotated  # else found in the images
     return result
 
@@ -187,6 +194,15 @@ def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping() -> None
     assert decided(pair(), far, (), LOST).seed == far
     assert decided(tagged, far, (), asked_for).seed == far
     assert decided(pair(), replace(SEED, trusted=False), (), asked_for).status == "seed_only"
+
+
+def test_the_seed_of_a_result_is_the_one_that_it_was_estimated_from() -> None:
+    """Descriptors start at the seed that was found, also where the tags contradict it."""
+    tagged = replace(pair(), seed_std_px={"rig": 1.0})
+    by_windows = replace(candidate(), joint=replace(joint_result(TRUTH), recipe=BY_WINDOWS))
+    for chosen, seed in ((candidate(), FAR), (by_windows, SEED)):
+        result = decided(tagged, FAR, [chosen])
+        assert (result.status, result.seed.fixed_to_moving.tolist()) == ("aligned", seed.fixed_to_moving.tolist())
 
 
 def test_of_tags_with_the_same_standard_error_the_preferred_one_replaces_a_seed() -> None:
@@ -381,11 +397,11 @@ def test_a_certain_prediction_by_windows_stays_within_the_error_of_an_uncertain_
 def test_the_relief_of_a_scene_is_part_of_the_error_and_not_of_the_comparison() -> None:
     """A plane that is compared with the rig is not displaced by the relief that it does not follow."""
     certain = rig_prediction(geometry.translation(10, -4), std_px=0.1)
-    of_rig = replace(certain, of_scene=replace(certain.of_scene, std_px=2.0))
+    of_rig = replace(certain, relief_std_px=2.0)
     vars(of_rig)["rotated"] = None
     result = against(of_rig, candidate())
     assert (result.status, result.issues[0].code) == ("predicted", "unexpected_px")
-    assert (result.issues[0].limit, result.prediction.std_px) == (3.0, 2.0)
+    assert (result.issues[0].limit, result.prediction.std_px) == (3.0, 2.0025)
 
 
 def test_a_rotated_image_has_failed_and_the_rig_does_not_replace_it() -> None:

@@ -81,7 +81,7 @@ def refined(capture: Capture, start: Candidate) -> Candidate:
 def in_files(*candidates: Candidate, of_rig: Prediction | None = None) -> Alignment:
     """The alignment between the files with these candidates."""
     pair = candidates[0].pair
-    predictions = {} if of_rig is None else {"nir": RigPrediction(pair, of_rig, of_rig, None)}
+    predictions = {} if of_rig is None else {"nir": RigPrediction(pair, of_rig)}
     result = decide([BandCandidates(pair, SEED, None, list(candidates))], (), predictions)
     return result["nir"].in_file_px(pair.scales, SIZE)
 

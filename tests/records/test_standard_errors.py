@@ -72,7 +72,7 @@ def estimate_and_write(
 
     def predictions(estimation: CaptureEstimation, *_: object) -> dict[str, RigPrediction]:
         parallax, prediction = estimation.decided()["NIR"].mapping.parallax, Prediction(planes[lost], "bands", 0.3)
-        return {lost: RigPrediction(estimation.bands[lost].pair, prediction, prediction, parallax)}
+        return {lost: RigPrediction(estimation.bands[lost].pair, prediction, parallax)}
 
     settings = agalign.Settings(
         relief=agalign.ReliefSettings(use=relief), write=agalign.WriteSettings(crop="none", error_map=True)

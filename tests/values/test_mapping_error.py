@@ -135,7 +135,7 @@ def test_the_error_of_the_relief_counts_where_it_is_larger_than_that_of_the_wind
     parallax = with_steps(scale)
     error = replace(error_of([0.05] * 4, columns(7)), parallax=parallax)
     points = np.random.default_rng(1).uniform(0, SIZE, (500, 2))
-    modelled_px2, unmodelled_px2 = error.smooth_px2(points)
+    modelled_px2, unmodelled_px2 = error.parts_px2(points)
     z_px2 = parallax.variance_px2(points)
     assert 0.1 < (z_px2 > unmodelled_px2).mean() < 0.9
     expected = np.sqrt(modelled_px2 + np.maximum(z_px2, unmodelled_px2))
