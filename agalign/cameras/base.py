@@ -18,10 +18,9 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.sun import Sun
 from agalign.cameras.tag_text import iso_time
 from agalign.cameras.xmp import Name
-from agalign.errors import GeometryError, NoSuchBandError
-from agalign.host.text import did_you_mean
+from agalign.errors import GeometryError
 from agalign.values import geometry
-from agalign.values.band_names import own_stem
+from agalign.values.band_names import no_such_band, own_stem
 from agalign.values.capture import Band, CaptureTime, Pose, Position
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
@@ -141,13 +140,7 @@ def reference_index(bands: Sequence[Band], wanted: str | None, path: Path, optio
     for index, band in enumerate(bands):
         if band_key(band.name) == band_key(wanted):
             return index
-    similar = did_you_mean(wanted, [b.name for b in bands])
-    raise NoSuchBandError(f"{path}: no band '{wanted}', as {option} asks{similar}; choose from {listed(bands)}")
-
-
-def listed(bands: Sequence[Band]) -> str:
-    """Return the names of bands, for a message."""
-    return ", ".join(b.name for b in bands)
+    raise no_such_band(path, wanted, (b.name for b in bands), by=option)
 
 
 def is_thermal(band: Band) -> bool:

@@ -17,11 +17,12 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
-from agalign.host.text import counted, did_you_mean
+from agalign.host.text import counted
 from agalign.pixels.coordinates import transformed
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
 from agalign.values.arguments import checked
+from agalign.values.band_names import no_such_band
 from agalign.values.capture import Band, Capture, Position, distance_km
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 from agalign.values.spectrum import band_key
@@ -178,8 +179,7 @@ def _check_bands(groups: Sequence[Sequence[ImageFile]], chosen: Sequence[str], f
         return
     for name in chosen:
         if band_key(name) not in known:
-            what = f"no capture has a band '{name}', as --bands asks{did_you_mean(name, known.values())}"
-            raise NoSuchBandError(f"{folder}: {what}; choose from {', '.join(known.values())}")
+            raise no_such_band(folder, name, known.values(), by="--bands")
     wanted = {band_key(name) for name in chosen}
     if all(sum(band_key(name) in wanted for name in names) < 2 for names in by_capture):
         what = f"--bands {','.join(chosen)}: leaves less than the two bands of a capture that alignment needs"

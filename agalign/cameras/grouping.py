@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from agalign.cameras import dji, pix4d
-from agalign.cameras.base import Camera, colour_bands, listed, reference_index
+from agalign.cameras.base import Camera, colour_bands, reference_index
 from agalign.cameras.generic import Generic, split_elsewhere, split_stem
 from agalign.cameras.image_file import ImageFile, Problem, natural_order, problem_of
 from agalign.cameras.makers import camera_of
@@ -406,7 +406,8 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
     wanted = {band_key(name) for name in names}
     bands = [b for file in files for b in file.bands if not wanted or band_key(b.name) in wanted]
     if len(bands) < 2 and names:
-        raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
+        left = bands[0].name if bands else "nothing"
+        raise InputError(f"{first.path}: of this capture, --bands leaves {left}")
     if len(bands) < 2:
         raise InputError(f"{first.path}: a band with no companion; {companion_advice(first.path)}")
     if len(files) == 1 and first.bands[0].one_lens:

@@ -2,12 +2,13 @@
 
 from pathlib import Path
 
-from agalign.errors import NoSuchBandError, SidecarError
+from agalign.errors import SidecarError
 from agalign.rasters.parallax_file import read_relief
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.arguments import checked
+from agalign.values.band_names import no_such_band
 
 
 def alignments_of(sidecar: Sidecar, folder: Path) -> dict[str, Alignment]:
@@ -56,7 +57,7 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     content = read_sidecar(path)
     moving = [b.band for b in content.bands if b.status != "reference"]
     if band not in moving:
-        raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {', '.join(moving)}")
+        raise no_such_band(path, band, moving, kind="moving band")
     if content.parallax is None and any(b.relief is not None for b in content.bands if b.band == band):
         raise SidecarError(f"{path}: its parallax was not written; run again with --overwrite")
     alignments = alignments_of(content, path.parent)

@@ -4,9 +4,11 @@ Texts from tags are limited in length first: the expressions are linear in the l
 """
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, NoSuchBandError
+from agalign.host.text import did_you_mean
 
 WORD = (
     r"(?:coastal|blue|green|red[ _-]?edge|near[ _-]?infra[ _-]?red|infra[ _-]?red|red|nir|swir|pan|panchro|lwir|"
@@ -25,6 +27,13 @@ _SUFFIX = re.compile(
 """A band at the end of a file name, after a separator, or `glued` to the name of the capture as in DJI_0001NIR."""
 _PREFIX = re.compile(rf"(?P<band>{WORD}|{SHORT})(?:[_\- ]|(?=\d))(?P<capture>.+)", re.IGNORECASE | re.DOTALL)
 """A band at the beginning of a file name, as in NIR01 or Red_IMG_0001."""
+
+
+def no_such_band(path: Path, wanted: str, known: Iterable[str], *, kind: str = "band", by: str = "") -> NoSuchBandError:
+    """Return the error of an unknown name of a band in a file or folder, which an option (`by`) asks for."""
+    names, asked = list(dict.fromkeys(known)), f", as {by} asks" if by else ""
+    what = f"no {kind} '{wanted}'{asked}{did_you_mean(wanted, names)}"
+    return NoSuchBandError(f"{path}: {what}; choose from {', '.join(names)}")
 
 
 def is_band_name(text: str) -> bool:

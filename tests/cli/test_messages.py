@@ -70,7 +70,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("info {tmp}", 1, ".png file in it or below it; there are only 2 no suffix, 1 .safe"),
         ("align {flight} -o {tmp}/o --reference SWIR", 2, "no band 'SWIR', as --reference asks; choose"),
         ("align {flight} -o {tmp}/o --reference Gren", 2, "no band 'Gren', as --reference asks " + GREEN),
-        ("align {flight} -o {tmp}/o --bands gren,nir", 2, "no capture has a band 'gren', as --bands asks " + GREEN),
+        ("align {flight} -o {tmp}/o --bands gren,nir", 2, "no band 'gren', as --bands asks " + GREEN),
         ("align {flight} -o {tmp}/o --bands Green", 2, "--bands Green: leaves less than the two bands"),
         ("align {flight} -o {tmp}/o --bands Green,NIR --reference red", 2, "asks; choose from Green, NIR"),
         ("align {flight} -o {tmp}/o --pattern {{capture}}_{{band}}.png", 2, "matches none of 10 images, such as IMG_"),
