@@ -87,9 +87,9 @@ class LearningCapture:
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
         observation = observed(pairs, result, capture)
         refined = {
-            name: RefinedPair(band.seed, band.refined.joint, band.pair.sizes_px)
+            name: RefinedPair(band.found, band.refined.joint, band.pair.sizes_px)
             for name, band in estimation.bands.items()
-            if isinstance(band.seed, Seed) and band.refined is not None and band.issue is None
+            if isinstance(band.found, Seed) and band.refined is not None and band.issue is None
         }
         return cls(capture, refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
 

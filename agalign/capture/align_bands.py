@@ -174,8 +174,8 @@ class CaptureEstimation:
 
     @property
     def seeds(self) -> dict[str, Seed]:
-        """The seeds of the bands that have one."""
-        return {name: band.seed for name, band in self.bands.items() if isinstance(band.seed, Seed)}
+        """The seeds that were found, at which descriptors start."""
+        return {name: band.found for name, band in self.bands.items() if isinstance(band.found, Seed)}
 
     def _refine(self) -> None:
         """Align the bands that the flight's network contains with this network."""
@@ -195,7 +195,7 @@ class CaptureEstimation:
             again = {band.pair.name: seed for band in lost if (seed := other_seed(band)) is not None}
             for name, result in self._optimised(again, refined, sides).items():
                 if is_retrieved(result):
-                    results[name], self.bands[name] = result, replace(self.bands[name], seed=again[name])
+                    results[name], self.bands[name] = result, replace(self.bands[name], found=again[name])
         self.add(results)
 
     def _learn(self, capture: Capture | None, *, relearn: bool) -> Alignments:
@@ -276,23 +276,23 @@ class CaptureEstimation:
         if not results:
             return
         for name, result in results.items():
-            found = self.bands[name]
-            if found.refined is None or is_retrieved(result) or not found.refined.joint.is_retrieved:
-                found.issue = result if isinstance(result, Issue) else None
-                found.refined = RefinedBand.of(found.pair, found.start, result)
+            band = self.bands[name]
+            if band.refined is None or is_retrieved(result) or not band.refined.joint.is_retrieved:
+                band.issue = result if isinstance(result, Issue) else None
+                band.refined = RefinedBand.of(band.pair, band.seed, result)
         use = self.settings.relief.use if self._may_be_homography else "never"
-        bands = self._combined()
+        combined = self._combined()
         self.progress(next(iter(results)), "relief", 0.0)  # with the name of the first band
-        reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
+        reliefs, along_a_line = by_relief(combined, use, is_observation=self.is_observation)
         self.reliefs += reliefs
         under = set.intersection(*map(set, self.reliefs)) if self.reliefs else set()  # whichever of them is chosen
         new = {*results} | {name for name, band in self.bands.items() if not band.candidates}
-        for band in bands:
-            name = band.pair.name
+        for refined in combined:
+            name = refined.pair.name
             if name in new - under and self.bands[name].issue is None:
                 self.progress(name, "checking", 0.0)
                 field_use = "never" if self.is_observation or name in along_a_line else use
-                self.bands[name].candidates += band.candidates(field_use)
+                self.bands[name].candidates += refined.candidates(field_use)
 
     def _combined(self) -> list[RefinedBand]:
         """Return the refined bands after the MAP estimation of all bands of the capture."""
@@ -313,13 +313,13 @@ class CaptureEstimation:
 
 def _corrected(band: BandCandidates) -> Seed | None:
     """Return the seed that windows correct, as tags may have the wrong scale; None if they do not."""
-    assert isinstance(band.seed, Seed)
-    return corrected(band.pair, band.seed)
+    assert isinstance(band.found, Seed)
+    return corrected(band.pair, band.found)
 
 
 def _contradicting(band: BandCandidates) -> Seed | None:
     """Return the seed of tags or flight if it contradicts the one that was found; None if it does not."""
-    return None if band.start is band.seed else band.start
+    return None if band.seed is band.found else band.seed
 
 
 def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None, capture: Capture | None) -> set[str]:

@@ -38,8 +38,8 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
     descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in band.rejected)
-    start = band.at_start
-    if not descriptors_failed or start is None or not band.does_start_fit:
+    start = band.at_seed
+    if not descriptors_failed or start is None or not band.does_seed_fit:
         return None
     max_moved_px = min(_MAX_MOVED_PX, pair.max_shift_px)
 
@@ -62,9 +62,9 @@ def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
     repetitive scene.
     """
     pair = band.pair
-    if not (pair.is_coarse and band.is_start_trusted):
+    if not (pair.is_coarse and band.is_seed_trusted):
         return None
-    start = pair.mapping(band.start.fixed_to_moving)
+    start = pair.mapping(band.seed.fixed_to_moving)
     windows = pair.reference.overlapping_windows
     fitted = fit_in_rounds(
         replace(start, field=None),

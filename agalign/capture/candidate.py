@@ -262,8 +262,8 @@ class BandCandidates:
     """All that the estimators found for a band."""
 
     pair: BandPair
-    seed: Seed | Issue
-    """The initial alignment, or why there is none."""
+    found: Seed | Issue
+    """The seed that the images confirm best, or why there is none: descriptors start at it."""
     issue: Issue | None = None
     """Why the last optimisation has no result, that the user asked for the seed only, or that pixels are unreadable."""
     candidates: list[Candidate] = field(default_factory=list)
@@ -274,31 +274,31 @@ class BandCandidates:
     """
 
     @cached_property
-    def start(self) -> Seed:
-        """The seed that is used."""
-        return seed_to_use(self.pair, self.seed, is_asked_for=self._is_asked_for)
+    def seed(self) -> Seed:
+        """The seed of windows and of bands without a result: that of tags or flight if it contradicts the one found."""
+        return seed_to_use(self.pair, self.found, is_asked_for=self._is_asked_for)
 
-    def start_of(self, candidate: Candidate) -> Seed:
+    def seed_of(self, candidate: Candidate) -> Seed:
         """Return the seed that a candidate was estimated from: descriptors start at the one that was found."""
         is_by_descriptors = candidate.joint is not None and candidate.joint.recipe != BY_WINDOWS
-        return self.seed if is_by_descriptors and isinstance(self.seed, Seed) else self.start
+        return self.found if is_by_descriptors and isinstance(self.found, Seed) else self.seed
 
     @cached_property
-    def at_start(self) -> WarpedPair | None:
+    def at_seed(self) -> WarpedPair | None:
         """The images and windows under the seed; None if there is none."""
-        if isinstance(self.seed, Issue):
+        if isinstance(self.found, Issue):
             return None
-        return WarpedPair.of(self.pair, self.pair.mapping(self.start.fixed_to_moving))
+        return WarpedPair.of(self.pair, self.pair.mapping(self.seed.fixed_to_moving))
 
     @property
-    def is_start_trusted(self) -> bool:
+    def is_seed_trusted(self) -> bool:
         """True if the seed may be used unchanged, provided that it fits the windows."""
-        return not isinstance(self.seed, Issue) and (self.start.trusted or self._is_asked_for)
+        return not isinstance(self.found, Issue) and (self.seed.trusted or self._is_asked_for)
 
     @property
-    def does_start_fit(self) -> bool:
+    def does_seed_fit(self) -> bool:
         """True if the windows agree with the seed."""
-        return self.at_start is not None and seed_fits(self.at_start.residual)
+        return self.at_seed is not None and seed_fits(self.at_seed.residual)
 
     @property
     def is_unreadable(self) -> bool:
@@ -313,8 +313,8 @@ class BandCandidates:
     @property
     def rejected(self) -> tuple[Issue, ...]:
         """Why the last estimate of the images was not accepted; not empty for a band without an accepted one."""
-        if isinstance(self.seed, Issue):
-            return (self.seed,)
+        if isinstance(self.found, Issue):
+            return (self.found,)
         if self.issue is not None:
             return (self.issue,)
         # Without any candidate, the band was only under a relief that is not chosen: nothing verifies its seed.

@@ -91,15 +91,15 @@ class _Choice:
         band, chosen = self.band, self.candidate
         pair = band.pair
         if chosen is None:
-            is_usable = band.is_start_trusted and band.does_start_fit and not self.is_seed_refused
-            is_misfit = band.is_start_trusted and not band.does_start_fit and not self.is_seed_refused
+            is_usable = band.is_seed_trusted and band.does_seed_fit and not self.is_seed_refused
+            is_misfit = band.is_seed_trusted and not band.does_seed_fit and not self.is_seed_refused
             return Alignment(
-                pair.mapping(band.start.fixed_to_moving),
+                pair.mapping(band.seed.fixed_to_moving),
                 pair.fixed.size_px,
                 (*self.issues, Issue(SEED_DOES_NOT_FIT)) if is_misfit else self.issues,
-                band.start,
+                band.seed,
                 joint=band.joint,
-                residual=None if self.is_seed_refused or band.at_start is None else band.at_start.residual,
+                residual=None if self.is_seed_refused or band.at_seed is None else band.at_seed.residual,
                 held_out_p95_px=band.candidates[-1].p95_by_geometry if band.candidates else {},
                 is_seed_usable=is_usable,
             )
@@ -107,7 +107,7 @@ class _Choice:
             chosen.mapping,
             pair.fixed.size_px,
             self.issues,
-            band.start_of(chosen),
+            band.seed_of(chosen),
             joint=band.joint if chosen.joint is None else chosen.joint,
             residual=chosen.residual,
             held_out_p95_px=chosen.p95_by_geometry,

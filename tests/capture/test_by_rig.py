@@ -106,7 +106,7 @@ class Estimated:
     def with_nir(self, *candidates: Candidate, issue: Issue | None = None, seed: Seed | None = None) -> "Estimated":
         """The same with other candidates of the NIR."""
         known = self.estimation.bands["NIR"]
-        nir = BandCandidates(known.pair, seed or known.seed, issue, list(candidates))
+        nir = BandCandidates(known.pair, seed or known.found, issue, list(candidates))
         reliefs = [without_nir(relief) for relief in self.estimation.reliefs]
         bands = {**self.estimation.bands, "NIR": nir}
         return replace(self, estimation=replace(self.estimation, bands=bands, reliefs=reliefs))
@@ -219,7 +219,7 @@ def test_a_more_accurate_prediction_by_windows_is_kept(first: Estimated) -> None
 
 def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: Estimated, model: FlightModel) -> None:
     """A plane does not contain the parallax of the flight."""
-    seed = replace(first.estimation.bands["NIR"].start, trusted=True)
+    seed = replace(first.estimation.bands["NIR"].seed, trusted=True)
     lost = first.with_nir(issue=Issue(RETRIEVAL, 0.1, 0.2), seed=seed).estimation.decided()
     in_relief = [replace(pair, relief_std_px=10.0) for pair in first.pairs]
     for pairs, names in (first.pairs, set()), (in_relief, {"NIR"}):

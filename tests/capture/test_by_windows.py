@@ -48,7 +48,7 @@ SEED = Seed("structure", geometry.translation(5.0, -3.0), 20.0, trusted=True)
 def lost(pair: BandPair, issue: Issue = SILENT) -> BandCandidates:
     """A band without a result of the descriptors, whose seed fits."""
     band = BandCandidates(pair, SEED, issue)
-    assert band.does_start_fit
+    assert band.does_seed_fit
     return band
 
 
@@ -90,7 +90,7 @@ def test_held_out_windows_must_confirm_the_fit(monkeypatch: pytest.MonkeyPatch) 
     assert after.issues[0].code in ("other_content", "inaccurate")  # the second is found first if both are true
     moving.pixels[:] = textured_image(*LARGE, seed=5)
     unrelated = BandCandidates(pair_of(fixed, moving), SEED, SILENT)
-    monkeypatch.setattr(BandCandidates, "does_start_fit", True)
+    monkeypatch.setattr(BandCandidates, "does_seed_fit", True)
     assert fitted_to_windows(unrelated).status == "seed_only"
 
 
