@@ -25,11 +25,13 @@ from agalign.values.residual import Residual, noise_px, square_weights
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
-_COMMON_ERROR_FACTOR = 12.0
+_COMMON_ERROR_FACTOR = 8.0
 """Factor on the variance of a mapping where it is extrapolated: the errors that neighbouring windows and patches have
-in common average out between them only. Assumed."""
-_FAR_SPACINGS = 3.0
-"""Window spacings, beyond the first, over which a mapping becomes an extrapolation; assumed."""
+in common average out between them only. Fitted, with _FAR_SPACINGS, to 16,700 tie points that are more than one spacing
+from the windows, in 342 bands that are noisy, blurred, half saturated or cropped: at any distance, 0.64 to 0.73 of the
+errors are below the expected error, and 0.93 to 0.96 below twice as much."""
+_FAR_SPACINGS = 2.0
+"""Window spacings, beyond the first, over which a mapping becomes an extrapolation."""
 _GAP_SPACINGS = 2.0
 """Window spacings that are left out between windows that verify a relief: these are in every other field of a
 chessboard, whose sides are four spacings. The windows of the fit are in the other fields."""
@@ -39,7 +41,7 @@ chessboard, whose sides are four spacings. The windows of the fit are in the oth
 class MappingError:
     """What the error of one mapping is made of, px of the reference.
 
-        error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2)
+        error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 7 far(x)) + far(x) (field^2 + relief^2)
                      + max(u(x)^2, z(x)^2, m(x)^2)
 
     D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 near the measured windows to 1, u is
