@@ -55,18 +55,20 @@ def learn_flight(
     start: FlightModel | None = None,
     run_tasks: RunTasks = serially,
     threads: int = 1,
+    timeout_s: float | None = None,
 ) -> FlightModel | None:
     """Return a model learned from a few captures spread over the flight, without its fingerprint; None if none of them
     could be aligned.
 
-    `run_tasks` processes single captures, and `threads` train the network; the result does not depend on them.
+    `run_tasks` processes single captures, and `threads` train the network; the result does not depend on them. Captures
+    that exceed the time limit are not learned from.
     `start` is an earlier model. It is returned if it still aligns captures of this flight as its rig predicts.
     Otherwise its network initialises theta; weights of bands that it lacks start from those of its last band.
     """
     keep_freed_memory()
     captures = [capture.with_absolute_paths() for capture in captures]
 
-    learned = _FlightLearner(captures, settings, progress, start, run_tasks, threads).learned()
+    learned = _FlightLearner(captures, settings, progress, start, run_tasks, threads, timeout_s).learned()
     if learned is None:
         return None
     times = sorted(c.known_time for c in captures if c.known_time)
@@ -87,6 +89,7 @@ class _FlightLearner:
     start: FlightModel | None
     run_tasks: RunTasks
     threads: int
+    timeout_s: float | None
 
     def learned(self) -> FlightModel | None:
         """Return the model, without its times and folder."""
@@ -128,6 +131,19 @@ class _FlightLearner:
         """Call a function with each argument, and yield the results in order."""
         return in_order(self.run_tasks, partial(in_one_thread, function), arguments)
 
+    def _from_each(
+        self, function: Callable[[A], LearningCapture | None], arguments: Sequence[A]
+    ) -> Iterator[LearningCapture | None]:
+        """Call a function with each capture, or its alternatives; yield the results in order, None for one that exceeds
+        the time limit: it is reported when it is aligned.
+        """
+
+        def no_result(_: A) -> LearningCapture | None:
+            return None
+
+        in_thread = partial(in_one_thread, function)
+        return in_order(self.run_tasks, in_thread, arguments, timeout_s=self.timeout_s, if_late=no_result)
+
     @property
     def _bands(self) -> tuple[str, ...]:
         return flight_lenses(self.captures)
@@ -149,7 +165,7 @@ class _FlightLearner:
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return False
         some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
-        tests = list(filter(None, self._apply(partial(observe_rig, portable(model), self.settings), some)))
+        tests = list(filter(None, self._from_each(partial(observe_rig, portable(model), self.settings), some)))
         known = [(band, one.observation) for one in tests for band in one.residuals]
         is_accurate = all(predict_band(model.rig, band, o).std_px <= DELIVERED_STD_PX for band, o in known)
         return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_accurate
@@ -164,7 +180,7 @@ class _FlightLearner:
         start = None if self.start is None else portable(self.start)
         task = partial(choose_and_refine, self._bands, self.settings, start)
         refined = []
-        for one in self._apply(task, [*stretches, *others]):
+        for one in self._from_each(task, [*stretches, *others]):
             refined.append(one)
             self.progress("the network", len(refined) / (len(stretches) + len(others)))
         chosen = [one for one in refined[: len(stretches)] if one is not None]
@@ -209,7 +225,7 @@ class _FlightLearner:
         task = partial(observe_rig, portable(model), self.settings)
         while waiting and (missing := count - _min_observations(result.values())) > 0:
             some, waiting = waiting[:missing], waiting[missing:]
-            for one in self._apply(task, some):
+            for one in self._from_each(task, some):
                 if one is not None:
                     earlier = result.get(one.capture.label, one)
                     result[one.capture.label] = max(earlier, one, key=lambda o: len(o.residuals))

@@ -335,7 +335,7 @@ class _FlightRun:
         with ExitStack() as stack:
             of_plan = numbers(plan.number)
             run_tasks = stack.enter_context(workers(*of_plan))
-            learn = partial(learn_flight, run_tasks=run_tasks, threads=min(MAX_THREADS, cores))
+            learn = partial(learn_flight, run_tasks=run_tasks, threads=min(MAX_THREADS, cores), timeout_s=timeout_s)
             tasks = []
             renderings = list(self._renderings(self._flights(plan, learn, record), plan))
             if (of_tasks := numbers(plan.number)) != of_plan:  # finished captures get the crop of the new model

@@ -167,11 +167,22 @@ def _submitted(executor: Executor, function: Callable[[A], R], task: A) -> "Futu
         return failed
 
 
-def in_order(run_tasks: RunTasks, function: Callable[[A], R], tasks: Sequence[A], /) -> Iterator[R]:
-    """Yield the results in the order of the tasks, as `map` does. Raises AgalignError, and MemoryError."""
+def in_order(
+    run_tasks: RunTasks,
+    function: Callable[[A], R],
+    tasks: Sequence[A],
+    /,
+    *,
+    timeout_s: float | None = None,
+    if_late: Callable[[A], R] | None = None,
+) -> Iterator[R]:
+    """Yield the results in the order of the tasks, as `map` does. Raises AgalignError, and MemoryError.
+
+    A task that exceeds the time limit has the result of `if_late`.
+    """
     waiting: dict[int, Callable[[], R]] = {}
     following = 0
-    for number, result in run_tasks(function, tasks):
+    for number, result in run_tasks(function, tasks, timeout_s=timeout_s):
         waiting[number] = result
         while following in waiting:
             try:
@@ -179,7 +190,11 @@ def in_order(run_tasks: RunTasks, function: Callable[[A], R], tasks: Sequence[A]
             except (AgalignError, MemoryError):
                 raise
             except Exception as error:
-                raise WorkerError(f"the flight cannot be learned: {failure_text(error)}") from error
+                # Dask reports the end of the worker of a task that exceeds its limit, and not why.
+                is_late = isinstance(error, TimeoutError) or (timeout_s is not None and _is_of_dask(error))
+                if if_late is None or not is_late:
+                    raise WorkerError(f"the flight cannot be learned: {failure_text(error)}") from error
+                value = if_late(tasks[following])
             yield value
             following += 1
 
@@ -199,9 +214,13 @@ def failure_text(error: Exception, timeout_s: float | None = None) -> str:
         case AgalignError():
             return str(error)
     first_line = next(iter(str(error).splitlines()), type(error).__name__)
-    if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
+    if isinstance(error, CancelledError) or _is_of_dask(error):
         return f"the cluster lost it ({first_line}); {run_again}"
     return f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
+
+
+def _is_of_dask(error: Exception) -> bool:
+    return type(error).__module__.partition(".")[0] == "distributed"
 
 
 @checked

@@ -1,4 +1,5 @@
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from agalign.batch import flight_learning as batch_learn
 from agalign.batch import learning_tasks
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
+from agalign.batch.workers import Completed
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions
 from agalign.flight.fingerprint import learning_fingerprint
@@ -227,6 +229,20 @@ def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     reports = list(run_flight(agalign.discover(learned_flight, TWO_PAIRS), tmp_path, SETTINGS))
     assert [r.is_complete for r in reports] == [True] * MIN_CAPTURES
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
+
+
+def test_captures_that_exceed_the_time_limit_are_not_learned_from(learned_flight: Path) -> None:
+    """They are reported when they are aligned."""
+    limits_s = set()
+
+    def late(_: Any, tasks: Sequence[Any], /, *, timeout_s: float | None = None) -> Completed[Any]:
+        limits_s.add(timeout_s)
+        for number in range(len(tasks)):
+            yield number, raising(TimeoutError())
+
+    captures = agalign.discover(learned_flight, TWO_PAIRS).captures
+    assert batch_learn.learn_flight(captures, SETTINGS, lambda *_: None, run_tasks=late, timeout_s=7.0) is None
+    assert limits_s == {7.0}
 
 
 @pytest.mark.full
