@@ -195,40 +195,30 @@ def _indices(
         except (OutputError, WorkerError) as error:  # the rasters that were reported, and their statistics, exist
             problems.append(str(error))
     is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)
-    code = _conclude([one.name for one in chosen], reports, folder, terminal, problems, as_json=as_json)
-    return ExitCode.PARTIAL if is_unfinished and code == ExitCode.OK else code
-
-
-def _conclude(
-    names: Sequence[str],
-    reports: "Sequence[IndexReport]",
-    folder: Path,
-    terminal: Terminal,
-    problems: "Sequence[str]" = (),
-    *,
-    as_json: bool,
-) -> int:
-    """Print the statistics of all indices, and return the exit code; `problems` say why captures are missing, or what
-    the table or the report lacks.
-    """
-    written = [r for r in reports if r.path is not None]
-    for problem in problems:
+    for problem in problems:  # why captures are missing, or what the table or the report lacks
         terminal.problem(problem)
+    written = [r for r in reports if r.path is not None]
     if as_json:
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
-        _print_table(names, reports, terminal)
-        if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
-            more = f" and {counted(len(masked) - 1, 'more capture')}" if masked[1:] else ""
-            terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
-        if doubtful := [r for r in written if r.problem]:
-            first = f"{doubtful[0].capture} {doubtful[0].index}: {doubtful[0].problem}"
-            rasters = counted(len(doubtful), "raster")
-            terminal.problem(f"{rasters} with bands to check (column problem of {INDICES_FILE}), such as {first}")
+        _print_statistics([one.name for one in chosen], reports, terminal)
         if not problems:
             terminal.result(f"Statistics: {folder / INDICES_FILE}")
-    is_complete = len(written) == len(reports) and not problems
+    is_complete = len(written) == len(reports) and not problems and not is_unfinished
     return ExitCode.NOTHING if not written else ExitCode.OK if is_complete else ExitCode.PARTIAL
+
+
+def _print_statistics(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
+    """Print the statistics of all indices, and what to check in them."""
+    written = [r for r in reports if r.path is not None]
+    _print_table(names, reports, terminal)
+    if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
+        more = f" and {counted(len(masked) - 1, 'more capture')}" if masked[1:] else ""
+        terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
+    if doubtful := [r for r in written if r.problem]:
+        first = f"{doubtful[0].capture} {doubtful[0].index}: {doubtful[0].problem}"
+        rasters = counted(len(doubtful), "raster")
+        terminal.problem(f"{rasters} with bands to check (column problem of {INDICES_FILE}), such as {first}")
 
 
 indices = Command(

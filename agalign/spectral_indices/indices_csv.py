@@ -61,7 +61,7 @@ def read_table(out: Path) -> list[IndexReport]:
     with suppress(OSError, csv.Error):
         for line in csv.DictReader(io.StringIO(read_regular(out / INDICES_FILE).decode(errors="replace"))):
             with suppress(ValueError, KeyError, TypeError, AttributeError):  # too few or too many cells
-                rows.append(_row(line, out))
+                rows.append(_report_of_row(line, out))
     return rows
 
 
@@ -126,13 +126,15 @@ def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
 
 
 def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
+    """Return the cells of a row, among them those of all columns."""
     folder, capture, _ = row.key
     place = {"folder": folder, "capture": capture, "input": row.statistics.unit}
     file = "" if row.path is None else row.path.relative_to(out).as_posix()
     return vars(row) | row.statistics.as_json() | place | {"file": file}
 
 
-def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
+def _report_of_row(cells: Mapping[str, str], out: Path) -> IndexReport:
+    """Return the report of which `_cells` wrote a row. Raises ValueError or KeyError."""
     cells = {k: _unquoted(v) for k, v in cells.items()}
     numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
     numbers["masked_share"] = float(cells["masked_share"] or 0)
