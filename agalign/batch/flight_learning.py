@@ -28,7 +28,7 @@ from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
-from agalign.flight.rig_prediction import predict_band
+from agalign.flight.rig_prediction import contradicts, predict_band
 from agalign.host.process_pool import A, R
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
@@ -159,16 +159,20 @@ class _FlightLearner:
     def _holds(self, model: FlightModel) -> bool:
         """Return True if an earlier model fits this flight, so that none must be learned.
 
-        It does if two captures, or the only one, can be aligned, and its rig predicts each aligned band from the others
-        with a standard error of at most DELIVERED_STD_PX.
+        It does if two captures, or the only one, can be aligned without its rig, and the rig predicts each aligned band
+        from the others: with a standard error of at most DELIVERED_STD_PX, and no contradiction.
         """
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return False
         some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
-        tests = list(filter(None, self._from_each(partial(observe_rig, portable(model), self.settings), some)))
+        without_rig = replace(portable(model), rig=None)
+        tests = list(filter(None, self._from_each(partial(observe_rig, without_rig, self.settings), some)))
         known = [(band, one.observation) for one in tests for band in one.residuals]
-        is_accurate = all(predict_band(model.rig, band, o).std_px <= DELIVERED_STD_PX for band, o in known)
-        return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_accurate
+        is_as_predicted = all(
+            predict_band(model.rig, band, o).std_px <= DELIVERED_STD_PX and not contradicts(model.rig, band, o)
+            for band, o in known
+        )
+        return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_as_predicted
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if no capture can be used.

@@ -7,7 +7,7 @@ from functools import partial
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import UnderRelief, by_relief
-from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, observed, rig_predictions
+from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, rig_predictions
 from agalign.capture.by_windows import fitted_to_windows, in_windows_that_agree, is_extrapolated, spreads_of_relief_px
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
@@ -242,7 +242,7 @@ class CaptureEstimation:
     def _predictions(self, result: Alignments, capture: Capture) -> dict[str, RigPrediction]:
         """Return the predictions of the rig of the flight from the aligned bands of the capture."""
         rig = None if self.model is None else self.model.rig
-        return {} if rig is None else rig_predictions(self.pairs, result, rig, observed(self.pairs, result, capture))
+        return {} if rig is None else rig_predictions(self.pairs, result, rig, capture)
 
     def _refine_on_files(self, result: Alignments, capture: Capture) -> Alignments:
         """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
@@ -332,7 +332,7 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig | Non
     lost = [pair.name for pair in pairs if not result[pair.name].is_usable(DELIVERED_STD_PX)]
     if not lost or rig is None or capture is None:
         return set(lost)
-    predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
+    predictions = rig_predictions(pairs, result, rig, capture)
 
     def is_skipped(name: str) -> bool:
         if name not in predictions:

@@ -269,7 +269,7 @@ def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
             result[band.name] = replace(candidate, given_issues=())
-    return result if _is_accepted(bands, result) else {}
+    return result if _is_relief_accepted(bands, result) else {}
 
 
 def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> UnderRelief:
@@ -287,8 +287,8 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Un
     estimate = estimate.with_std_px(held_out)
     result: dict[str, Candidate] = {}
     for band, warped in zip(estimate.bands, held_out, strict=True):
-        result |= estimate.candidate(band, warped)
-    if not _is_accepted(estimate.bands, result):
+        result |= estimate.accepted_candidate(band, warped)
+    if not _is_relief_accepted(estimate.bands, result):
         return {}
     result |= estimate.of_other_bands(others)
     if any(band.pair.has_rig for band in group):
@@ -394,10 +394,10 @@ class _Estimate:
                 continue
             with suppress(GeometryError):
                 band = self.band_under_relief(other)
-                result |= {} if band is None else self.candidate(band, band.held_out(self.relief))
+                result |= {} if band is None else self.accepted_candidate(band, band.held_out(self.relief))
         return result
 
-    def candidate(self, band: _Band, held_out: WarpedPair) -> dict[str, Candidate]:
+    def accepted_candidate(self, band: _Band, held_out: WarpedPair) -> dict[str, Candidate]:
         """Return the candidate of a band by the relief of all bands, with its name, and with its held-out windows.
 
         Empty if the checks find issues, and the candidate may not predict, its windows are few, or half of them are not
@@ -430,7 +430,7 @@ def _with_field_on_relief(candidate: Candidate) -> Candidate:
     return candidate if result.issues and not candidate.issues else result
 
 
-def _is_accepted(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:
+def _is_relief_accepted(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:
     """Return True if held-out windows of half of the bands fit a relief better than a homography.
 
     A band that it predicts counts only if a homography cannot align it: fields follow small parallax better.

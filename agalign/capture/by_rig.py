@@ -20,6 +20,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax
+from agalign.verify.checks import rig_issues
 
 DELIVERED_STD_PX = CheckSettings().accept_predicted_px
 """Standard error of a prediction, px of the band, up to which the estimation counts a band as delivered: the default,
@@ -56,10 +57,13 @@ class RigPrediction:
     @cached_property
     def candidate(self) -> Candidate:
         """The predicted mapping; the windows under it say nothing about it, as the band did not pass verification."""
+        return Candidate(self.pair, self._warped.mapping, self.error, self._warped.residual)
+
+    @property
+    def error(self) -> MappingError:
+        """Its error: of the reference plane, of the baseline or the missing relief, and of the relief."""
         std_px = math.hypot(self.std_px(self.fixed_to_moving), self.relief_std_px)
-        mapping = self._warped.mapping
-        error = MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=mapping.parallax)
-        return Candidate(self.pair, mapping, error, self._warped.residual)
+        return MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=self.parallax)
 
     @property
     def is_delivered(self) -> bool:
@@ -79,6 +83,19 @@ class RigPrediction:
     def std_px(self, fixed_to_moving: Matrix) -> float:
         """Return the standard error, px of the fixed image, for a homography between the images."""
         return self.of_plane.std_px / self.pair.in_moving_file_px(1.0, fixed_to_moving)
+
+    def compared(self, fixed_to_moving: Matrix) -> Prediction:
+        """Return the prediction with its distance from a homography between the images."""
+        return replace(self.of_plane, off_px=self.distance_px(fixed_to_moving))
+
+    def contradicted(self, compared: Prediction) -> Candidate:
+        """Return the predicted mapping if the images confirm another one: which of them is right is unknown, so their
+        distance is part of the error.
+        """
+        assert compared.off_px is not None
+        distance_px = compared.off_px / self.pair.in_moving_file_px(1.0, self.fixed_to_moving)
+        error = self.candidate.error
+        return replace(self.candidate, error=replace(error, rig_std_px=math.hypot(error.rig_std_px, distance_px)))
 
     def distance_px(self, fixed_to_moving: Matrix) -> float:
         """Return the RMS distance of a homography between the images from the prediction, px of the moving file."""
@@ -126,6 +143,25 @@ def rig_prediction(pair: BandPair, rig: Rig, known: Observation) -> RigPredictio
 
 
 def rig_predictions(
+    pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture
+) -> dict[str, RigPrediction]:
+    """Return the prediction of each band of the rig from the other aligned bands of a capture, with its relief.
+
+    Bands that contradict the predictions from the others do not predict them.
+    """
+    known = observed(pairs, result, capture)
+    predictions = _from_known(pairs, result, rig, known)
+    mappings, std_px = {}, {}
+    for name in known.mappings:
+        of_rig = predictions.get(name)
+        if of_rig is None or not any(rig_issues(of_rig.compared(result[name].fixed_to_moving))):
+            mappings[name], std_px[name] = known.mappings[name], known.std_px[name]
+    if len(mappings) == len(known.mappings):
+        return predictions
+    return _from_known(pairs, result, rig, replace(known, mappings=mappings, std_px=std_px))
+
+
+def _from_known(
     pairs: Sequence[BandPair], result: Alignments, rig: Rig, known: Observation
 ) -> dict[str, RigPrediction]:
     """Return the prediction of each band of the rig from the `known` bands of the capture, with its relief."""

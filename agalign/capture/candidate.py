@@ -85,9 +85,15 @@ class Candidate:
         return {**earlier, **self.held_out_p95_px}
 
     @property
+    def issues_of_prediction(self) -> tuple[Issue, ...]:
+        """Its issues, with those of the pixels also if there are others."""
+        pixels = () if self.given_issues is not None else self._issues_of_pixels
+        return (*self.issues, *(issue for issue in pixels if issue not in self.issues))
+
+    @property
     def may_predict(self) -> bool:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
-        found = (*self.issues, *self._issues_of_pixels) if self.given_issues is None else ()
+        found = self.issues_of_prediction if self.given_issues is None else ()
         return all(issue.kind in PREDICTED_WITH for issue in found) and math.isfinite(self.std_px)
 
     @cached_property
@@ -263,7 +269,8 @@ class BandCandidates:
 
     pair: BandPair
     found: Seed | Issue
-    """The seed that the images confirm best, or why there is none: descriptors start at it."""
+    """The seed with the highest score, at which descriptors start, or another from which they found the band; or why
+    there is none."""
     issue: Issue | None = None
     """Why the last optimisation has no result, that the user asked for the seed only, or that pixels are unreadable."""
     candidates: list[Candidate] = field(default_factory=list)

@@ -20,8 +20,9 @@ beside a relief it is `predicted`, as indices would mix two geometries. Every st
 `Alignment.status` follows from the issues and the prediction that are set here.
 
 The prediction of the rig of the flight replaces what contradicts it, seeds, what has failed, and predictions that are
-less certain or show another scene in a part of the image. An image that is rotated or scaled relative to its rig does
-not fit it: it has `failed`, and the rig does not replace it.
+less certain or show another scene in a part of the image. If an accepted mapping contradicts it, which of the two is
+right is unknown: their distance is part of the error. An image that is rotated or scaled relative to its rig does not
+fit it: it has `failed`, and the rig does not replace it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -139,29 +140,31 @@ def _of_images(band: BandCandidates, relief: UnderRelief) -> _Choice:
     predicting = [candidate for candidate in band.candidates if candidate.may_predict]
     if predicting:
         best = min(predicting, key=lambda candidate: candidate.std_px)
-        return _Choice(band, best, best.issues)
+        return _Choice(band, best, best.issues_of_prediction)
     return _Choice(band, None, band.rejected)
 
 
 def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:
     """Return the choice as compared with the prediction of the rig, or this prediction."""
-    own, off_px = choice.candidate, None
-    if own is not None and not choice.issues:
-        off_px = of_rig.distance_px(own.mapping.fixed_to_moving)
-        compared = replace(of_rig.of_plane, off_px=off_px)
-        issues = tuple(rig_issues(compared))
-        if not issues:
-            return replace(choice, compared=compared)
-        if own.refined_from is not None:  # the refinement on the files contradicts the rig
-            return _against_rig(replace(choice, candidate=own.refined_from), of_rig)
-        choice, own = replace(choice, issues=issues), None
+    own = choice.candidate
     # Windows of another scene contribute to the mapping of the band, but not to the rig's.
     is_mixed = any(issue.kind == OTHER_CONTENT for issue in choice.issues)
     if own is not None and not is_mixed:
-        near = replace(of_rig.of_plane, off_px=of_rig.distance_px(own.mapping.fixed_to_moving))
-        if not any(rig_issues(near)) and own.std_px <= of_rig.candidate.std_px:
+        compared = of_rig.compared(own.mapping.fixed_to_moving)
+        contradictions = tuple(rig_issues(compared))
+        if not contradictions and not choice.issues:
+            return replace(choice, compared=compared)
+        if not contradictions and own.std_px <= of_rig.candidate.std_px:
             return choice
+        if not choice.issues:
+            if own.refined_from is not None:  # the refinement on the files contradicts the rig
+                return _against_rig(replace(choice, candidate=own.refined_from), of_rig)
+            if of_rig.rotated is None:
+                return replace(
+                    choice, candidate=of_rig.contradicted(compared), issues=contradictions, compared=compared
+                )
+            choice = replace(choice, issues=contradictions)
     if of_rig.rotated is not None:
         unexpected = Issue(UNEXPECTED_PX, of_rig.distance_px(of_rig.rotated), MAX_UNEXPECTED_PX)
         return _Choice(choice.band, None, (unexpected, *choice.issues), is_seed_refused=True)
-    return replace(choice, candidate=of_rig.candidate, compared=replace(of_rig.of_plane, off_px=off_px))
+    return replace(choice, candidate=of_rig.candidate, compared=of_rig.of_plane)

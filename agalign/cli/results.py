@@ -160,7 +160,7 @@ def _indices(
         index: Names separated by commas: ndvi (the default), ndre, savi …
         formula: A formula of the bands B, G, R, RE and N, such as 'name=(N-R)/(N+R)'; repeatable.
         target: Folder for the rasters; by default next to the stacks.
-        mask_qa: Omit saturated, occluded and misaligned pixels; the run needs --qa.
+        mask_qa: Omit saturated, occluded and misaligned pixels, also of finished indices; the run needs --qa.
         as_json: Print JSON to standard output.
         overwrite: Compute finished indices again.
 

@@ -18,6 +18,7 @@ from agalign.flight.rig import (
     Rig,
     affine_difference,
     capture_factors,
+    distance_px,
     expected_square,
     mapping_weight,
 )
@@ -25,6 +26,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Prediction
 from agalign.values.choices import PredictionSource
 from agalign.values.geometry import Matrix
+from agalign.verify.checks import rig_issues
 
 Array = NDArray[np.float64]
 Captures = Sequence[CaptureFactors]
@@ -93,6 +95,13 @@ def band_summaries(rig: Rig) -> list[dict[str, Any]]:
         }
         for band, mean in rig.mean.items()
     ]
+
+
+def contradicts(rig: Rig, band: str, known: Observation) -> bool:
+    """Return True if an observed band is farther from its prediction from the others than their errors allow."""
+    predicted = predict_band(rig, band, known)
+    off_px = distance_px(known.mappings[band], predicted.fixed_to_moving, rig.size_px)
+    return any(rig_issues(replace(predicted, off_px=off_px)))
 
 
 def _from_bands(rig: Rig, band: str, known: Observation) -> tuple[Matrix, PredictionSource, float]:

@@ -25,7 +25,7 @@ from agalign.values.residual import Residual, noise_px, square_weights
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
-_COMMON_ERROR_FACTOR = 8.0
+_FAR_VARIANCE_FACTOR = 8.0
 """Factor on the variance of a mapping where it is extrapolated: the errors that neighbouring windows and patches have
 in common average out between them only. Fitted, with _FAR_SPACINGS, to 16,700 tie points that are more than one spacing
 from the windows, in 342 bands that are noisy, blurred, half saturated or cropped: at any distance, 0.64 to 0.73 of the
@@ -106,7 +106,7 @@ class MappingError:
     def parts_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the parts (n,) of the square that vary smoothly: all but u, z and m, and u, at points (n, 2)."""
         far = self._far(points_px)
-        modelled_px2 = self.rig_std_px**2 + self._covariance_px2(points_px) * (1 + far * (_COMMON_ERROR_FACTOR - 1))
+        modelled_px2 = self.rig_std_px**2 + self._covariance_px2(points_px) * (1 + far * (_FAR_VARIANCE_FACTOR - 1))
         modelled_px2 = modelled_px2 + far * (self.field_std_px**2 + self.relief_std_px**2)
         # The windows are measured with a relief from other bands: their shifts contain its error.
         return modelled_px2, self._unmodelled_px2(points_px, far)

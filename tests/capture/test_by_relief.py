@@ -24,12 +24,12 @@ from agalign.capture.by_relief import (
     _common_parallax_px,
     _decreases_shifts,
     _Estimate,
-    _is_accepted,
+    _is_relief_accepted,
     _std_px,
     _with_field_on_relief,
     by_relief,
 )
-from agalign.capture.by_rig import _parallax_by_rig, observed, rig_predictions
+from agalign.capture.by_rig import _parallax_by_rig, rig_predictions
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
 from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
@@ -514,7 +514,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     }
     reliefs = [without_blue]
     known = decide(bands, reliefs)
-    predictions = rig_predictions(pairs, known, rig, observed(pairs, known, Capture("a", Path(), (), 0)))
+    predictions = rig_predictions(pairs, known, rig, Capture("a", Path(), (), 0))
     result = decide(bands, reliefs, predictions)
     # The other bands are verified by the rig as before.
     assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}
@@ -644,14 +644,14 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
     aligned = SimpleNamespace(issues=(), residual=relief, pair=SimpleNamespace(file_pixel_size_px=1.0))
     predicted = SimpleNamespace(**vars(aligned) | {"issues": (Issue(RETRIEVAL),)})
-    assert _is_accepted(bands[:1], {"Blue": aligned}) == is_chosen
-    assert _is_accepted(bands, {"Blue": aligned, "Red": aligned}) == is_chosen
-    assert not _is_accepted(bands, {"Blue": aligned})
+    assert _is_relief_accepted(bands[:1], {"Blue": aligned}) == is_chosen
+    assert _is_relief_accepted(bands, {"Blue": aligned, "Red": aligned}) == is_chosen
+    assert not _is_relief_accepted(bands, {"Blue": aligned})
     # A prediction counts only where homographies align no band.
-    assert _is_accepted(bands, dict.fromkeys(("Blue", "Red"), predicted)) == (is_chosen and plane.p95_px > 1)
+    assert _is_relief_accepted(bands, dict.fromkeys(("Blue", "Red"), predicted)) == (is_chosen and plane.p95_px > 1)
     larger = SimpleNamespace(file_pixel_size_px=10.0)  # pixels
     on_larger_pixels = SimpleNamespace(**vars(predicted) | {"pair": larger})  # homographies align these
-    assert not _is_accepted(bands, dict.fromkeys(("Blue", "Red"), on_larger_pixels))
+    assert not _is_relief_accepted(bands, dict.fromkeys(("Blue", "Red"), on_larger_pixels))
 
 
 def windows_with(median_px: float, p95_px: float) -> Residual:

@@ -230,6 +230,26 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
     assert bands_to_learn(in_relief, {**replaced, "NIR": of_chance}, model.rig, first.capture) == set()
 
 
+def test_a_band_that_contradicts_the_rig_does_not_predict_the_others(first: Estimated) -> None:
+    """A shift along the baselines is that of a nearer scene, too: a single other band is moved with it."""
+    nir, baseline = first.estimation.decided()["NIR"], np.array(first.estimation.model.rig.baselines["NIR"])
+    x, y = 25.0 * baseline / np.linalg.norm(baseline)
+    matrix = geometry.compose(geometry.translation(x, y), nir.fixed_to_moving)
+    mapping = replace(nir.mapping, fixed_to_moving=matrix).without_parallax
+    pair = first.estimation.bands["NIR"].pair
+    shifted = Candidate(pair, mapping, nir.error, nir.residual, nir.joint, given_issues=())
+    result = first.with_nir(shifted).predicted()
+    assert [(name, a.status) for name, a in result.items()] == [("Red", "aligned"), ("NIR", "predicted")]
+    assert result["NIR"].prediction.std_px > 3.0
+
+
+@pytest.mark.full
+def test_a_model_is_learned_again_if_one_lens_has_moved(captures: Captures, model: FlightModel) -> None:
+    nir = geometry.compose(geometry.translation(5.0, 0.0), model.rig.mean["NIR"])
+    moved = replace(model, rig=replace(model.rig, mean={**model.rig.mean, "NIR": nir}))
+    assert learned(captures, moved).rig is not moved.rig
+
+
 @pytest.mark.full
 def test_a_flight_that_nothing_can_be_learned_from_has_the_rig_of_the_given_model(
     captures: Captures, model: FlightModel, tmp_path: Path

@@ -87,7 +87,7 @@ def test_held_out_windows_must_confirm_the_fit(monkeypatch: pytest.MonkeyPatch) 
     moving.pixels[:, 480:] = textured_image(320, 640, seed=5)  # unrelated content
     after = fitted_to_windows(lost(pair_of(fixed, moving)))
     assert after.status == "predicted"
-    assert after.issues[0].code in ("other_content", "inaccurate")  # the second is found first if both are true
+    assert "other_content" in [issue.code for issue in after.issues]
     moving.pixels[:] = textured_image(*LARGE, seed=5)
     unrelated = BandCandidates(pair_of(fixed, moving), SEED, SILENT)
     monkeypatch.setattr(BandCandidates, "does_seed_fit", True)

@@ -9,7 +9,7 @@ import re
 from functools import cache
 from pathlib import Path
 
-from bands.results import USABLE_PX, comparison, read_results
+from bands.results import comparison, read_results
 from bands.run import RESULTS
 from bands.score import read_sets
 from figures_csv import HEAD, is_current, read_figures
@@ -101,30 +101,6 @@ def test_the_comparison_counts_the_results_of_the_benchmark() -> None:
         for head, value in row.cells.items():
             found = figures()[f"{row.table} / {row.name} / {head.rpartition(', ')[0] or head}"]
             assert (found["value"] or "-", found["n"]) == (str(value), row.n)
-
-
-def test_status_by_damage_is_that_of_the_benchmarks() -> None:
-    page = (ROOT / "docs" / "explanation" / "accuracy.md").read_text(encoding="utf-8")
-    section = page.partition("## Status by damage")[2].partition("\n## ")[0]
-    results = read_results(RESULTS)
-
-    def of_pairs(variant: str, method: str = "agalign, pair") -> list[str]:
-        own = [r for r in results if (r.method, r.variant) == (method, variant)]
-        predicted = [r for r in own if not r.claimed and r.std_px <= USABLE_PX]
-        good = [r for r in own if r.claimed] + predicted
-        counts = len(good) - len(predicted), len(predicted), len(own) - len(good)
-        return [" / ".join(map(str, counts)), f"{max(r.median_px for r in good):.2f}"]
-
-    rows = re.findall(r"^\| (.+) \|$", section, re.MULTILINE)[1:]
-    assert len(rows) == 4
-    for name, *cells in (row.split(" | ") for row in rows):
-        assert cells == of_pairs("as it is" if name == "none" else name)
-    counts, worst = of_pairs("as it is", "agalign, capture, no tags")
-    assert f"{counts}, worst {worst} px" in " ".join(section.split())
-    lost = [f for f in figures() if ": one band each / " in f]
-    predicted = sum(int(figures()[f]["value"]) for f in lost if f.endswith(" / predicted"))
-    worst_px = max(float(figures()[f]["value"]) for f in lost if f.endswith(" / worst band"))
-    assert f"[0 / {predicted} / 0](failures.md#predicted-bands), worst {worst_px:.2f} px" in section
 
 
 def test_rounded_quotes() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px, expected_square
-from agalign.flight.rig_prediction import predict_band, unobserved_error_px
+from agalign.flight.rig_prediction import contradicts, predict_band, unobserved_error_px
 from agalign.values import geometry
 
 SIZE = 1280, 960
@@ -222,3 +222,12 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
 def test_few_errors_may_be_small_by_chance() -> None:
     """The variance of a further error from the mean square of n: 2 for three, 1.03 for sixty."""
     np.testing.assert_allclose(expected_square([1.0] * 4, [1, 2, 3, 60]), [3.0, 3.0, 2.0, 61 / 59])
+
+
+def test_a_lens_that_moved_contradicts_the_rig_though_the_others_predict_it_accurately() -> None:
+    rig, known = learn_rig(flight(), SIZE, BASELINES), observation(3.5, 0.4)
+    assert not any(contradicts(rig, band, known) for band in BASELINES)
+    nir = geometry.compose(geometry.translation(5.0, 0.0), known.mappings["NIR"])
+    moved = replace(known, mappings={**known.mappings, "NIR": nir})
+    assert max(predict_band(rig, band, moved).std_px for band in BASELINES) < 1.0
+    assert [band for band in BASELINES if contradicts(rig, band, moved)] == ["NIR"]
