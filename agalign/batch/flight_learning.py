@@ -1,5 +1,6 @@
 """Learn the model of a flight: one network for all its captures, from a few of them, and its rig."""
 
+import logging
 import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,9 +28,10 @@ from agalign.fit.displacement_field import common_field
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
-from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
+from agalign.flight.rig import MIN_CAPTURES, Observation, Rig, median_mapping
 from agalign.flight.rig_prediction import contradicts, predict_band
 from agalign.host.process_pool import A, R
+from agalign.host.text import some_of
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -93,8 +95,13 @@ class _FlightLearner:
 
     def learned(self) -> FlightModel | None:
         """Return the model, without its times and folder."""
-        if self.start is not None and self._holds(self.start):
-            return self.start
+        start, rig = self.start, self._start_rig
+        if start is not None and rig is not None and set(self._bands) <= set(start.bands):
+            observations = self._observed(start)
+            if _contradict(rig, observations):
+                return replace(self, start=replace(start, rig=None)).learned()
+            if self._holds(rig, observations):
+                return start
         are_enough = len(self.captures) >= MIN_CAPTURES
         if are_enough and (learned := self._from_captures()) is not None:
             return learned
@@ -132,17 +139,21 @@ class _FlightLearner:
         return in_order(self.run_tasks, partial(in_one_thread, function), arguments)
 
     def _from_each(
-        self, function: Callable[[A], LearningCapture | None], arguments: Sequence[A]
+        self, function: Callable[[A], LearningCapture | None], arguments: Sequence[A], captures: int = 1
     ) -> Iterator[LearningCapture | None]:
-        """Call a function with each capture, or its alternatives; yield the results in order, None for one that exceeds
-        the time limit: it is reported when it is aligned.
+        """Call a function with each argument, of up to this many captures; yield the results in order, and None for one
+        that exceeds the time limit.
         """
 
-        def no_result(_: A) -> LearningCapture | None:
+        def no_result(argument: A) -> LearningCapture | None:
+            some = argument if isinstance(argument, tuple) else (argument,)
+            names = some_of(capture.label for capture in some if isinstance(capture, Capture))
+            logging.getLogger(__name__).warning("agalign: %s: not learned from, as it exceeds --timeout", names)
             return None
 
-        in_thread = partial(in_one_thread, function)
-        return in_order(self.run_tasks, in_thread, arguments, timeout_s=self.timeout_s, if_late=no_result)
+        in_thread, timeout_s = partial(in_one_thread, function), self.timeout_s
+        limit_s = None if timeout_s is None else captures * timeout_s
+        return in_order(self.run_tasks, in_thread, arguments, timeout_s=limit_s, if_late=no_result)
 
     @property
     def _bands(self) -> tuple[str, ...]:
@@ -156,23 +167,22 @@ class _FlightLearner:
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
 
-    def _holds(self, model: FlightModel) -> bool:
-        """Return True if an earlier model fits this flight, so that none must be learned.
-
-        It does if two captures, or the only one, can be aligned without its rig, and the rig predicts each aligned band
-        from the others: with a standard error of at most DELIVERED_STD_PX, and no contradiction.
-        """
-        if model.rig is None or not set(self._bands) <= set(model.bands):
-            return False
+    def _observed(self, model: FlightModel) -> list[LearningCapture]:
+        """Return two captures, or the only one, aligned by a model without its rig; those that can be."""
         some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
         without_rig = replace(portable(model), rig=None)
-        tests = list(filter(None, self._from_each(partial(observe_rig, without_rig, self.settings), some)))
-        known = [(band, one.observation) for one in tests for band in one.residuals]
-        is_as_predicted = all(
-            predict_band(model.rig, band, o).std_px <= DELIVERED_STD_PX and not contradicts(model.rig, band, o)
-            for band, o in known
-        )
-        return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_as_predicted
+        tests = list(self._from_each(partial(observe_rig, without_rig, self.settings), some))
+        return [one for one in tests if one is not None] if None not in tests else []
+
+    def _holds(self, rig: Rig, observations: Sequence[LearningCapture]) -> bool:
+        """Return True if an earlier model with this rig fits the flight, so that none must be learned.
+
+        It does if half of the bands of the observations are aligned, and its rig predicts each of them from the others
+        with a standard error of at most DELIVERED_STD_PX.
+        """
+        known = _known(rig, observations)
+        is_accurate = all(predict_band(rig, band, o).std_px <= DELIVERED_STD_PX for band, o in known)
+        return bool(observations) and 2 * len(known) >= len(observations) * len(self._bands) and is_accurate
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if no capture can be used.
@@ -184,7 +194,7 @@ class _FlightLearner:
         start = None if self.start is None else portable(self.start)
         task = partial(choose_and_refine, self._bands, self.settings, start)
         refined = []
-        for one in self._from_each(task, [*stretches, *others]):
+        for one in self._from_each(task, [*stretches, *others], max(map(len, stretches))):
             refined.append(one)
             self.progress("the network", len(refined) / (len(stretches) + len(others)))
         chosen = [one for one in refined[: len(stretches)] if one is not None]
@@ -252,6 +262,16 @@ class _FlightLearner:
             if field is not None and band not in extrapolation_px
         }
         return replace(rig, extrapolation_px=extrapolation_px, fields=known)
+
+
+def _known(rig: Rig, observations: Iterable[LearningCapture]) -> list[tuple[str, Observation]]:
+    """Return the aligned bands of the rig, each with all mappings of its capture."""
+    return [(band, one.observation) for one in observations for band in one.residuals if band in rig.mean]
+
+
+def _contradict(rig: Rig, observations: Iterable[LearningCapture]) -> bool:
+    """Return True if an aligned band contradicts its prediction by a rig."""
+    return any(contradicts(rig, band, observation) for band, observation in _known(rig, observations))
 
 
 def _min_observations(observations: Iterable[LearningCapture]) -> int:

@@ -190,8 +190,9 @@ def in_order(
             except (AgalignError, MemoryError):
                 raise
             except Exception as error:
-                # Dask reports the end of the worker of a task that exceeds its limit, and not why.
-                is_late = isinstance(error, TimeoutError) or (timeout_s is not None and _is_of_dask(error))
+                # Dask reports that a task has ended its workers, and not why.
+                is_killed = timeout_s is not None and type(error).__name__ == "KilledWorker"
+                is_late = isinstance(error, TimeoutError) or is_killed
                 if if_late is None or not is_late:
                     raise WorkerError(f"the flight cannot be learned: {failure_text(error)}") from error
                 value = if_late(tasks[following])
@@ -214,13 +215,9 @@ def failure_text(error: Exception, timeout_s: float | None = None) -> str:
         case AgalignError():
             return str(error)
     first_line = next(iter(str(error).splitlines()), type(error).__name__)
-    if isinstance(error, CancelledError) or _is_of_dask(error):
+    if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
         return f"the cluster lost it ({first_line}); {run_again}"
     return f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
-
-
-def _is_of_dask(error: Exception) -> bool:
-    return type(error).__module__.partition(".")[0] == "distributed"
 
 
 @checked

@@ -20,7 +20,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax
-from agalign.verify.checks import rig_issues
 
 DELIVERED_STD_PX = CheckSettings().accept_predicted_px
 """Standard error of a prediction, px of the band, up to which the estimation counts a band as delivered: the default,
@@ -145,26 +144,8 @@ def rig_prediction(pair: BandPair, rig: Rig, known: Observation) -> RigPredictio
 def rig_predictions(
     pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture
 ) -> dict[str, RigPrediction]:
-    """Return the prediction of each band of the rig from the other aligned bands of a capture, with its relief.
-
-    Bands that contradict the predictions from the others do not predict them.
-    """
+    """Return the prediction of each band of the rig from the other aligned bands of a capture, with its relief."""
     known = observed(pairs, result, capture)
-    predictions = _from_known(pairs, result, rig, known)
-    mappings, std_px = {}, {}
-    for name in known.mappings:
-        of_rig = predictions.get(name)
-        if of_rig is None or not any(rig_issues(of_rig.compared(result[name].fixed_to_moving))):
-            mappings[name], std_px[name] = known.mappings[name], known.std_px[name]
-    if len(mappings) == len(known.mappings):
-        return predictions
-    return _from_known(pairs, result, rig, replace(known, mappings=mappings, std_px=std_px))
-
-
-def _from_known(
-    pairs: Sequence[BandPair], result: Alignments, rig: Rig, known: Observation
-) -> dict[str, RigPrediction]:
-    """Return the prediction of each band of the rig from the `known` bands of the capture, with its relief."""
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
     predictions: dict[str, RigPrediction] = {}

@@ -133,7 +133,7 @@ def _of_images(band: BandCandidates, relief: UnderRelief) -> _Choice:
         return _Choice(band, None, band.rejected, is_seed_refused=True)
     under = relief.get(band.pair.name)
     if under is not None:
-        return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues) if under.issues else ())
+        return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues_of_prediction) if under.issues else ())
     if accepted := band.accepted:
         is_beside = any(other.pair.reference is band.pair.reference for other in relief.values())
         return _Choice(band, accepted[-1], (Issue(OTHER_GEOMETRY),) if is_beside else ())

@@ -231,8 +231,9 @@ def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
 
 
-def test_captures_that_exceed_the_time_limit_are_not_learned_from(learned_flight: Path) -> None:
-    """They are reported when they are aligned."""
+def test_captures_that_exceed_the_time_limit_are_not_learned_from(
+    learned_flight: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     limits_s = set()
 
     def late(_: Any, tasks: Sequence[Any], /, *, timeout_s: float | None = None) -> Completed[Any]:
@@ -241,8 +242,11 @@ def test_captures_that_exceed_the_time_limit_are_not_learned_from(learned_flight
             yield number, raising(TimeoutError())
 
     captures = agalign.discover(learned_flight, TWO_PAIRS).captures
-    assert batch_learn.learn_flight(captures, SETTINGS, lambda *_: None, run_tasks=late, timeout_s=7.0) is None
-    assert limits_s == {7.0}
+    for several, limit_s in (captures, 7.0), (captures * 3, 21.0):  # of up to three captures, the best is learned from
+        assert batch_learn.learn_flight(several, SETTINGS, lambda *_: None, run_tasks=late, timeout_s=7.0) is None
+        assert limits_s == {limit_s}
+        limits_s.clear()
+    assert f"{captures[0].label}: not learned from, as it exceeds --timeout" in caplog.text
 
 
 @pytest.mark.full

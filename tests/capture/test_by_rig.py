@@ -230,17 +230,18 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
     assert bands_to_learn(in_relief, {**replaced, "NIR": of_chance}, model.rig, first.capture) == set()
 
 
-def test_a_band_that_contradicts_the_rig_does_not_predict_the_others(first: Estimated) -> None:
-    """A shift along the baselines is that of a nearer scene, too: a single other band is moved with it."""
+@pytest.mark.parametrize("off_px", [8.0, 25.0])
+def test_of_two_bands_that_contradict_each_other_neither_is_accurate(first: Estimated, off_px: float) -> None:
+    """A shift along the baselines is that of a nearer scene, too: nothing decides which of them is wrong."""
     nir, baseline = first.estimation.decided()["NIR"], np.array(first.estimation.model.rig.baselines["NIR"])
-    x, y = 25.0 * baseline / np.linalg.norm(baseline)
+    x, y = off_px * baseline / np.linalg.norm(baseline)
     matrix = geometry.compose(geometry.translation(x, y), nir.fixed_to_moving)
     mapping = replace(nir.mapping, fixed_to_moving=matrix).without_parallax
     pair = first.estimation.bands["NIR"].pair
     shifted = Candidate(pair, mapping, nir.error, nir.residual, nir.joint, given_issues=())
-    result = first.with_nir(shifted).predicted()
-    assert [(name, a.status) for name, a in result.items()] == [("Red", "aligned"), ("NIR", "predicted")]
-    assert result["NIR"].prediction.std_px > 3.0
+    for alignment in first.with_nir(shifted).predicted().values():
+        assert (alignment.status, alignment.issues[0].code) == ("predicted", "unexpected_px")
+        assert alignment.prediction.std_px > 3.0
 
 
 @pytest.mark.full
@@ -248,6 +249,17 @@ def test_a_model_is_learned_again_if_one_lens_has_moved(captures: Captures, mode
     nir = geometry.compose(geometry.translation(5.0, 0.0), model.rig.mean["NIR"])
     moved = replace(model, rig=replace(model.rig, mean={**model.rig.mean, "NIR": nir}))
     assert learned(captures, moved).rig is not moved.rig
+
+
+def test_a_flight_without_a_rig_of_its_own_has_none_that_its_bands_contradict(
+    captures: Captures, model: FlightModel
+) -> None:
+    """One capture determines no rig. A rig may lack a band of the network, too."""
+    without_red = {name: mean for name, mean in model.rig.mean.items() if name != "Red"}
+    assert learned(captures[:1], replace(model, rig=replace(model.rig, mean=without_red))).rig is not None
+    nir = geometry.compose(geometry.translation(12.0, -9.0), model.rig.mean["NIR"])
+    moved = replace(model.rig, mean={**model.rig.mean, "NIR": nir})
+    assert learned(captures[:1], replace(model, rig=moved)).rig is None
 
 
 @pytest.mark.full

@@ -397,6 +397,9 @@ def test_another_scene_is_found_also_in_an_inaccurate_result() -> None:
         result = against(rig_prediction(AT_RIG, std_px=5.0), candidate(std_px=1.0, images=images))
         assert (result.prediction.source, result.issues[0].code) == (source, "inaccurate")
     assert result.issues[1].code == "other_content"
+    relief = candidate(std_px=1.0, images=seen, relief=flat_relief())
+    under = decide([BandCandidates(pair(), SEED, None, [candidate()])], [{"NIR": relief}])["NIR"]
+    assert [i.code for i in under.issues] == ["other_geometry", "inaccurate", "other_content"]
 
 
 def test_a_certain_prediction_by_windows_stays_within_the_error_of_an_uncertain_rig() -> None:
