@@ -65,7 +65,8 @@ def learn_flight(
     `run_tasks` processes single captures, and `threads` train the network; the result does not depend on them. Captures
     that exceed the time limit are not learned from.
     `start` is an earlier model. It is returned if it still aligns captures of this flight as its rig predicts.
-    Otherwise its network initialises theta; weights of bands that it lacks start from those of its last band.
+    Otherwise its network initialises theta; weights of bands that it lacks start from those of its last band. Its rig
+    is that of a flight that determines none, unless a capture contradicts it.
     """
     keep_freed_memory()
     captures = [capture.with_absolute_paths() for capture in captures]
@@ -168,11 +169,11 @@ class _FlightLearner:
         return self.captures[0].reference.size_px
 
     def _observed(self, model: FlightModel) -> list[LearningCapture]:
-        """Return two captures, or the only one, aligned by a model without its rig; those that can be."""
+        """Return two captures, or the only one, aligned by a model without its rig; empty if one of them cannot be."""
         some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
         without_rig = replace(portable(model), rig=None)
-        tests = list(self._from_each(partial(observe_rig, without_rig, self.settings), some))
-        return [one for one in tests if one is not None] if None not in tests else []
+        tests = list(filter(None, self._from_each(partial(observe_rig, without_rig, self.settings), some)))
+        return tests if len(tests) == len(some) else []
 
     def _holds(self, rig: Rig, observations: Sequence[LearningCapture]) -> bool:
         """Return True if an earlier model with this rig fits the flight, so that none must be learned.

@@ -287,10 +287,10 @@ class BandCandidates:
 
     def seed_of(self, candidate: Candidate) -> Seed:
         """Return the seed that a candidate was estimated from: descriptors start at the one that was found."""
-        by_windows = None if candidate.joint is None else candidate.joint.recipe == BY_WINDOWS
-        if by_windows and candidate.mapping.parallax is not None and self.refined is not None:
-            by_windows = self.refined.joint.recipe == BY_WINDOWS  # the relief was fitted from there
-        is_by_descriptors = by_windows is False
+        estimated = candidate.joint
+        if estimated is not None and candidate.mapping.parallax is not None and self.refined is not None:
+            estimated = self.refined.joint  # from which the relief was estimated
+        is_by_descriptors = estimated is not None and estimated.recipe != BY_WINDOWS
         return self.found if is_by_descriptors and isinstance(self.found, Seed) else self.seed
 
     @cached_property

@@ -29,7 +29,8 @@ _FAR_VARIANCE_FACTOR = 8.0
 """Factor on the variance of a mapping where it is extrapolated: the errors that neighbouring windows and patches have
 in common average out between them only. Fitted, with _FAR_SPACINGS, to 16,700 tie points that are more than one spacing
 from the windows, in 342 bands that are noisy, blurred, half saturated or cropped: at any distance, 0.64 to 0.73 of the
-errors are below the expected error, and 0.93 to 0.96 below twice as much."""
+errors are below the expected error, and 0.93 to 0.96 below twice as much. benchmarks/errors_by_distance.py counts these
+shares for single pairs."""
 _FAR_SPACINGS = 2.0
 """Window spacings, beyond the first, over which a mapping becomes an extrapolation."""
 _GAP_SPACINGS = 2.0

@@ -119,7 +119,7 @@ def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(
             list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
         with pytest.raises(MemoryError):
             list(in_order(run, without_memory, [0]))
-        late = in_order(run, sleep, [0.0, 3600.0, 0.1], timeout_s=5.0, if_late=lambda seconds: -seconds)
+        late = in_order(run, sleep, [0.0, 3600.0, 0.1], timeout_s=1.0, if_late=lambda seconds: -seconds)
         assert list(late) == [0.0, -3600.0, 0.1]
         with pytest.raises(WorkerError, match="the flight cannot be learned"):
             list(in_order(run, sleep, [3600.0], timeout_s=1.0))

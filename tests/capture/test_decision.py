@@ -12,7 +12,7 @@ from agalign.capture import decision
 from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.by_relief import UnderRelief
 from agalign.capture.by_rig import RigPrediction
-from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
+from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand, mapping_error
 from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
 from agalign.values import geometry
@@ -204,6 +204,10 @@ def test_the_seed_of_a_result_is_the_one_that_it_was_estimated_from() -> None:
     for chosen, seed in ((candidate(), FAR), (by_windows, SEED)):
         result = decided(tagged, FAR, [chosen])
         assert (result.status, result.seed.fixed_to_moving.tolist()) == ("aligned", seed.fixed_to_moving.tolist())
+    under = replace(candidate(relief=flat_relief()), joint=by_windows.joint)
+    refined = RefinedBand.of(tagged, SEED, joint_result(TRUTH))
+    result = decide([BandCandidates(tagged, FAR, refined=refined)], [{"NIR": under}])["NIR"]
+    assert (result.geometry, result.seed.fixed_to_moving.tolist()) == ("relief", FAR.fixed_to_moving.tolist())
 
 
 def test_of_tags_with_the_same_standard_error_the_preferred_one_replaces_a_seed() -> None:
