@@ -10,11 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, without_descriptors
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.window_fit import WindowFit, cross_fitted, fit_in_rounds
+from agalign.fit.window_fit import cross_fitted, fit_in_rounds, held_out_of_overlapping
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
@@ -70,7 +71,7 @@ def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
         replace(start, field=None),
         lambda mapping: WarpedPair.of(pair, mapping, windows).residual,
         pair.fixed.size_px,
-        _is_consistent,
+        lambda fit: _are_consistent(fit.residuals_px),
         pair.lens_std_px,
         max_moved_px=min(_MAX_MOVED_PX, pair.max_shift_px),
     )
@@ -80,18 +81,21 @@ def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
     warped = WarpedPair.of(pair, mapping, windows)
     if warped.alias_peak.ratio > MAX_ALIAS_PEAK:
         return None
-    error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, mapping.field)
-    evidence = warped.residual, band.joint, warped
-    return Candidate(pair, mapping, error, *evidence, given_issues=band.rejected)
+    size_px = pair.fixed.size_px
+    held_out = held_out_of_overlapping(warped.residual, mapping, windows.side, size_px, pair.lens_std_px)
+    if not _are_consistent(held_out.lengths_px):
+        return None
+    error = mapping_error(pair, mapping, fit.covariance_px2, held_out, mapping.field)
+    return Candidate(pair, mapping, error, held_out, band.joint, warped, given_issues=band.rejected)
 
 
-def _is_consistent(fit: WindowFit) -> bool:
-    """Return True if the windows of a coarse band, which overlap by half, agree with their fit."""
+def _are_consistent(residuals_px: NDArray[np.float64]) -> bool:
+    """Return True if the windows of a coarse band, which overlap by half, agree with a mapping."""
     min_windows = 16  # twice the eight parameters of a homography; the lens shapes have a prior
     # Px of the reduced reference, 1.5 px of the band. By chance, one in a hundred windows of at least 56 px is closer.
     max_close_px, min_close_share = 3.0, 0.85
-    count = len(fit.residuals_px)
-    return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
+    count = len(residuals_px)
+    return count >= min_windows and bool((residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
 def is_extrapolated(candidate: Candidate) -> bool:

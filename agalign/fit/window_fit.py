@@ -20,6 +20,7 @@ is known, positive parallax is nearer to the camera.
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -251,6 +252,27 @@ def held_out_residual(
     """
     black_px, white_px = (residual_under(residual, mapping, by).shifts_px for by in (by_black, by_white))
     return residual.with_shifts(np.where(residual.is_even_cell[:, None], white_px, black_px))
+
+
+def held_out_of_overlapping(
+    residual: Residual, mapping: PixelMapping, side_px: int, size_px: tuple[int, int], lens_std_px: Array | None
+) -> Residual:
+    """Return the residual of overlapping windows, measured with `mapping`, with the shift of each window under one that
+    is fitted, with lens shapes, to the windows without common pixels; NaN if these determine none.
+
+    `side_px` is that of the windows; the other arguments are those of `fit_windows`.
+    """
+    plane = replace(mapping, field=None)
+    of_plane, result = residual_under(residual, mapping, plane), np.full_like(residual.shifts_px, np.nan)
+    for window in np.flatnonzero(residual.is_measured):
+        distances_px = np.abs(residual.centres_px - residual.centres_px[window]).max(axis=1)
+        fit = fit_windows(plane, of_plane.where(distances_px >= side_px), size_px, lens_std_px)
+        if fit is None:
+            continue
+        with suppress(GeometryError):
+            one = of_plane.where(np.arange(len(result)) == window)
+            result[window] = residual_under(one, plane, fit.applied_to(plane)).shifts_px[0]
+    return residual.with_shifts(result)
 
 
 @dataclass(frozen=True)

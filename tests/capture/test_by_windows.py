@@ -281,6 +281,24 @@ def test_a_coarse_band_without_any_candidate_is_not_verified_by_the_windows_of_i
     assert by_windows.issues == (Issue(OTHER_GEOMETRY),)
 
 
+def test_the_error_of_a_coarse_band_is_by_windows_without_their_part_in_the_fit(scene: np.ndarray) -> None:
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.5))
+    by_windows = module.in_windows_that_agree(BandCandidates(band.pair, band.seed, band.issue))
+    of_fit = by_windows.images.residual
+    assert by_windows.error.residual is by_windows.residual
+    assert by_windows.residual.std_px > of_fit.std_px
+
+
+def test_a_coarse_band_whose_windows_agree_in_the_fit_only_is_not_predicted(
+    scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
+    monkeypatch.setattr(
+        module, "held_out_of_overlapping", lambda residual, *_: residual.with_shifts(residual.shifts_px + 9)
+    )
+    assert module.in_windows_that_agree(BandCandidates(band.pair, band.seed, band.issue)) is None
+
+
 def test_a_coarse_band_has_the_error_of_the_relief_of_its_flight(scene: np.ndarray) -> None:
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
     over_trees = replace(band.pair, relief_std_px=3.0)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import WindowFit, cross_fitted, fit_windows
+from agalign.fit.window_fit import WindowFit, cross_fitted, fit_windows, held_out_of_overlapping
 from agalign.values import geometry
 from agalign.values.lens_shapes import CALIBRATED, LENS_STD, jacobian, lens_shapes, lens_std_px, variance_px2
 from agalign.values.mapping import DisplacementField, PixelMapping
@@ -84,6 +84,27 @@ def test_all_windows_are_fitted_and_each_is_verified_by_the_other_half() -> None
     assert cross_fitted(IDENTITY, measure, SIZE, 1.0) is None
     black = CENTRES[found.held_out.is_even_cell]
     assert cross_fitted(IDENTITY, lambda _: windows(CORNERS_PX, black), SIZE) is None
+
+
+def test_an_overlapping_window_is_verified_without_those_that_share_pixels_with_it() -> None:
+    """A window that moves changes its own residual by as much, and no residual of those that overlap it."""
+    side_px, lens_std = 112, lens_std_px(SIZE, calibrated=False)
+    centres_px = grid_px(np.arange(56, 1280, 56), np.arange(56, 960, 56))
+    residual, window = windows(TRUTH_PX, centres_px), 150
+    moved_px = residual.shifts_px.copy()
+    moved_px[window] += 2.0, 1.0
+    before, after = (
+        held_out_of_overlapping(one, IDENTITY, side_px, SIZE, lens_std)
+        for one in (residual, residual.with_shifts(moved_px))
+    )
+    assert rms(before.shifts_px) < 0.1
+    change_px = after.shifts_px - before.shifts_px
+    np.testing.assert_allclose(change_px[window], (2.0, 1.0), atol=0.01)
+    distance_px = np.abs(centres_px - centres_px[window]).max(axis=1)
+    assert np.count_nonzero(distance_px < side_px) == 9
+    overlaps = (distance_px < side_px) & (distance_px > 0)
+    np.testing.assert_allclose(change_px[overlaps], 0, atol=1e-9)
+    assert np.abs(change_px[distance_px >= side_px]).max() > 1e-4
 
 
 @pytest.mark.parametrize("magnification", [1.0, 0.1])
