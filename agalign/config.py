@@ -289,8 +289,8 @@ class WriteSettings(SettingsModel):
     interpolation: choices.Interpolation = "lanczos"
     """Resampling of the moving bands."""
     crop: choices.Crop = "flight"
-    """Area to write: covered by all bands in all captures of a camera (flight; in each capture, if its flights have no
-    rig, as with fewer than three captures) or in this capture (common), or the whole reference band (none)."""
+    """Area to write: covered by all bands in all captures of a camera (flight; without a rig, as of two captures:
+    common) or in this capture (common), or the whole reference band (none)."""
     format: choices.RasterFormat = "gtiff"
     """Tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: choices.Compression = "auto"
@@ -328,13 +328,13 @@ class WriteSettings(SettingsModel):
     """Interpolate occluded pixels; by default they are nodata."""
     radiometry: Annotated[choices.RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
     """Convert raw numbers to radiance (camera), or to reflectance by the light sensor (sun) or by a calibration panel
-    and the light sensor, if any (panel). auto, or --radiometry alone, uses the first that all
-    bands have: panel with light sensor, sun, panel alone, camera. Thermal bands become degrees C."""
+    and the light sensor, if any (panel). auto, or --radiometry alone: the first that all bands have of panel with
+    light sensor, sun, panel alone, camera. Thermal bands become degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
     ] = ()
-    """Reflectance of the calibration panel, such as 0.51 or Blue=0.51,NIR=0.49; for panels without tags or QR code."""
+    """Reflectance of the calibration panel, such as 0.51 or Blue=0.51,NIR=0.49, instead of that in tags or QR code."""
 
 
 class Settings(SettingsModel):

@@ -20,9 +20,9 @@ beside a relief it is `predicted`, as indices would mix two geometries. Every st
 `Alignment.status` follows from the issues and the prediction that are set here.
 
 The prediction of the rig of the flight replaces what contradicts it, seeds, what has failed, and predictions that are
-less certain or show another scene in a part of the image. If an accepted mapping contradicts it, which of the two is
-right is unknown: their distance is part of the error. An image that is rotated or scaled relative to its rig does not
-fit it: it has `failed`, and the rig does not replace it.
+less certain or show another scene in a part of the image. If an accepted mapping contradicts it, or one that is
+confirmed in parts and certain, which of the two is right is unknown: their distance is part of the error. An image that
+is rotated or scaled relative to its rig does not fit it: it has `failed`, and the rig does not replace it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.values.alignment import STD_DECIMALS, Alignment, Alignments, Prediction
 from agalign.values.issues import OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, Issue
-from agalign.verify.checks import MAX_UNEXPECTED_PX, rig_issues
+from agalign.verify.checks import MAX_UNEXPECTED_PX, max_expected_px, rig_issues
 
 
 def decide(
@@ -156,14 +156,14 @@ def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:
             return replace(choice, compared=compared)
         if not contradictions and own.std_px <= of_rig.candidate.std_px:
             return choice
-        if not choice.issues:
-            if own.refined_from is not None:  # the refinement on the files contradicts the rig
-                return _against_rig(replace(choice, candidate=own.refined_from), of_rig)
+        if not choice.issues and own.refined_from is not None:  # the refinement on the files contradicts the rig
+            return _against_rig(replace(choice, candidate=own.refined_from), of_rig)
+        own_std_px = own.pair.in_moving_file_px(own.std_px, own.mapping.fixed_to_moving)
+        if contradictions and (not choice.issues or (compared.off_px or 0.0) > max_expected_px(own_std_px)):
+            issues = (*contradictions, *choice.issues)
             if of_rig.rotated is None:
-                return replace(
-                    choice, candidate=of_rig.contradicted(compared), issues=contradictions, compared=compared
-                )
-            choice = replace(choice, issues=contradictions)
+                return replace(choice, candidate=of_rig.contradicted(compared), issues=issues, compared=compared)
+            choice = replace(choice, issues=issues)
     if of_rig.rotated is not None:
         unexpected = Issue(UNEXPECTED_PX, of_rig.distance_px(of_rig.rotated), MAX_UNEXPECTED_PX)
         return _Choice(choice.band, None, (unexpected, *choice.issues), is_seed_refused=True)

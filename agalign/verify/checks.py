@@ -189,10 +189,13 @@ def _largest_cluster(cells: NDArray[np.int64]) -> int:
 
 def rig_issues(prediction: Prediction) -> Iterator[Issue]:
     """Distance of a result from the prediction by the rig, which detects aliasing in repetitive scenes."""
-    if prediction.off_px is not None:
-        limit_px = max(MAX_UNEXPECTED_PX, _MAX_UNEXPECTED_STD * prediction.std_px)
-        if not prediction.off_px <= limit_px:
-            yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
+    if prediction.off_px is not None and not prediction.off_px <= (limit_px := max_expected_px(prediction.std_px)):
+        yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
+
+
+def max_expected_px(std_px: float) -> float:
+    """Return the distance up to which a mapping with this standard error does not contradict another one, px."""
+    return max(MAX_UNEXPECTED_PX, _MAX_UNEXPECTED_STD * std_px)
 
 
 class AliasPeak(NamedTuple):
