@@ -58,6 +58,8 @@ def test_tables_of_the_readme() -> None:
     tables = re.findall(r"^(\|.+\|)\n\|[-|: ]+\|\n((?:\|.+\|\n)+)", text, re.MULTILINE)
     for head, body in tables:
         heads = [cell.strip() for cell in head.strip("|").split("|")]
+        if not heads[0]:  # that of the comparison
+            continue
         for row in body.splitlines():
             name, *cells = (cell.strip(" *") for cell in row.strip("|").split("|"))
             for column, cell in zip(heads[1:], cells, strict=True):
@@ -69,6 +71,29 @@ def test_tables_of_the_readme() -> None:
                     quoted += 1
                     assert is_quoted(cell, figures()[fact]["value"]), f"{cell}: {fact}"
     assert quoted
+
+
+def test_the_comparison_of_the_readme() -> None:
+    """Its columns are facts of two tables, with accepted and wrong pairs as `39 (0)`."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (body,) = re.findall(r"^\| \| 45 pairs .*\n\|[-|]+\|\n((?:\|.+\|\n)+)", text, re.MULTILINE)
+    for row in body.splitlines():
+        name, wrong, median_px, *of_copies = (cell.strip() for cell in row.strip("|").split("|"))
+        originals, degraded = "comparison, originals with tags", "comparison, degraded copies"
+        quoted = [(wrong, f"{originals} / {name} / wrong"), (median_px, f"{originals} / {name} / median error")]
+        copies, limited = of_copies
+        alone, _, with_predicted = copies.partition("; with predicted ")
+        for cell, facts in (
+            (alone, f"{degraded} / {name}"),
+            (with_predicted, f"{degraded} / {name}, with predicted"),
+            (limited, f"limits, degraded copies / {name}, with a limit"),
+        ):
+            assert bool(cell) == (f"{facts} / accepted" in figures()), facts
+            if cell:
+                accepted, of_these = re.fullmatch(r"(\d+) \(([\d-]+)\)", cell).groups()
+                quoted += [(accepted, f"{facts} / accepted"), (of_these, f"{facts} / wrong")]
+        for cell, fact in quoted:
+            assert cell in re.split(r"[ ()]+", figures()[fact]["value"]), fact
 
 
 def test_every_figure_has_the_version_that_was_measured() -> None:
