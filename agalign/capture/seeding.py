@@ -34,7 +34,7 @@ thermal and a blue image to three quarters."""
 
 
 def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
-    """Return the best seed of a pair, or the issue that prevents one.
+    """Return the best seed of a pair, or the issue that prevents one, such as a forced kind that it lacks.
 
     With `force` "match", descriptors of the network of `model` are matched.
     """
@@ -50,6 +50,8 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
         if result is None:
             return Issue(NO_SUCH_SEED, detail="match")
         matrices = {"match": result}
+    elif force not in (None, "structure", *matrices):  # the peaks of other kinds are structure
+        return Issue(NO_SUCH_SEED, detail=force)
     best = best_seed(pair, matrices, force)
     # A mapping by the flight or the user or a forced seed excludes other positions.
     is_given = settings.force is not None or pair.has_rig or "user" in pair.seed_matrices

@@ -96,14 +96,20 @@ def step_from(net: Descriptor, band: LevelBand, patches: ReferencePatches, famil
 def converge(net: Descriptor, band: LevelBand, all_patches: ReferencePatches, family: ModelFamily | None) -> Step:
     """Take steps on psi until no corner moves by more than `_FINAL_CONVERGED_PX`; return the last one.
 
-    Long steps use half of the patches. Steps with all patches shrink by a constant ratio, so every second one is
-    extended by the sum of the geometric series (Aitken 1926). A step of infinite length is the last one and is not
-    applied: the patches do not determine the mapping.
+    Long steps use half of the patches, if these are enough. Steps with all patches shrink by a constant ratio, so every
+    second one is extended by the sum of the geometric series (Aitken 1926). A step of infinite length is the last one
+    and is not applied: the patches do not determine the mapping.
     """
     patches, previous_px = all_patches.head(len(all_patches.f) // 2), math.inf
     max_final_steps = 10  # maximum number of steps at full resolution
     for _ in range(max_final_steps):
-        step = step_from(net, band, patches, family)
+        try:
+            step = step_from(net, band, patches, family)
+        except NotEnoughTextureError:
+            if patches is all_patches:
+                raise
+            patches = all_patches
+            continue
         if not math.isfinite(step.length_px):
             break
         ratio = min(step.length_px / previous_px, _MAX_RATIO)

@@ -208,18 +208,21 @@ def _vertex(left: float, centre: float, right: float) -> float:
 def blur_px(raster: Raster) -> float:
     """Return the length at which a single-channel image varies: the RMS of first over that of second derivatives, px.
 
-    It is measured in the central half of both sides. Sharp images have 1.3 to 2.2 px, noisy ones up to 1.4, and those
-    with a Gaussian blur of 3 px at least 2.8.
+    It is measured in the central half of both sides, or everywhere if no pixel is valid there. Sharp images have 1.3 to
+    2.2 px, noisy ones up to 1.4, and those with a Gaussian blur of 3 px at least 2.8.
     """
     height, width = raster.valid.shape
-    central = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    smooth = cv2.GaussianBlur(raster.pixels[central], (0, 0), 1.0)
+    central, everywhere = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4], np.s_[:, :]
+    for part in (central, everywhere):
+        inside = cv2.erode(raster.valid[part].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        if inside.any():
+            break
+    else:
+        return 0.0
+    smooth = cv2.GaussianBlur(raster.pixels[part], (0, 0), 1.0)
     first = [cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1))]
     second = [
         cv2.Scharr(gradient, cv2.CV_32F, *order, scale=1 / 32) for gradient in first for order in ((1, 0), (0, 1))
     ]
-    inside = cv2.erode(raster.valid[central].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    if not inside.any():
-        return 0.0
     squares = [sum(float((d[inside] ** 2).mean()) for d in derivatives) for derivatives in (first, second)]
     return math.sqrt(squares[0] / squares[1]) if squares[1] > 0 else 0.0

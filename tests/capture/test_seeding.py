@@ -19,6 +19,7 @@ from agalign.values.alignment import Seed
 from agalign.values.capture import Band, Georeference
 from agalign.values.choices import SeedKind
 from agalign.values.image import Raster
+from agalign.values.issues import NO_SUCH_SEED, Issue
 from agalign.values.mapping import PixelMapping
 
 from ..builders import pair_of, residual_of, texture, two_views
@@ -53,6 +54,13 @@ def test_a_forced_seed_is_used_whatever_its_score(kind: SeedKind) -> None:
     seed = best(two_views(SHIFTED), candidates, kind)
     assert seed.kind == kind
     np.testing.assert_array_equal(seed.fixed_to_moving, candidates[kind])
+
+
+@pytest.mark.parametrize("kind", ["rig", "geo", "user"])
+def test_a_forced_seed_that_a_pair_lacks_is_an_issue(kind: SeedKind) -> None:
+    pair = pair_of(*two_views(SHIFTED), {"identity": np.eye(3)})
+    assert find_seed(pair, SeedSettings(force=kind)) == Issue(NO_SUCH_SEED, detail=kind)
+    assert find_seed(pair, SeedSettings(force="structure")).kind == "structure"
 
 
 def test_windows_correct_the_scale_of_a_seed() -> None:

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from agalign.config import JointSettings
+from agalign.errors import NotEnoughTextureError
 from agalign.method.gauss_newton import Step
 from agalign.method.gauss_newton import solve as solve_equations
-from agalign.method.levels import Level, make_level
+from agalign.method.levels import Level, LevelBand, make_level
 from agalign.method.patches import homography_from_psi, transform
 from agalign.method.refine import ReferencePatches, converge, refine
 from agalign.method.state import ImageGroup, JointState, MovingImage
@@ -133,6 +134,19 @@ def test_steps_with_a_constant_ratio_are_extrapolated_and_infinite_ones_left_out
     patches = ReferencePatches(*(torch.zeros(4, 2),) * 3)
     assert converge(None, band, patches, "homography").length_px == pytest.approx(last_px, abs=0.03)
     assert float(band.h[0, 2]) == pytest.approx(end, abs=1e-3)
+
+
+def test_all_patches_are_used_if_half_of_them_are_too_few(level: Level, monkeypatch: pytest.MonkeyPatch) -> None:
+    def step_from(_net: object, band: LevelBand, patches: ReferencePatches, *_: object) -> Step:
+        if len(patches.f) < 20:
+            raise NotEnoughTextureError(len(patches.f), 20)
+        return halving(float(band.h[0, 2]))
+
+    monkeypatch.setattr("agalign.method.refine.step_from", step_from)
+    (band,) = level.bands
+    assert converge(None, band, ReferencePatches(*(torch.zeros(24, 2),) * 3), "homography").length_px < 0.06
+    with pytest.raises(NotEnoughTextureError):
+        converge(None, band, ReferencePatches(*(torch.zeros(16, 2),) * 3), "homography")
 
 
 def test_an_infinite_last_step_means_unknown_corners(group: ImageGroup, monkeypatch: pytest.MonkeyPatch) -> None:

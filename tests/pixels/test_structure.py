@@ -13,6 +13,7 @@ from agalign.pixels.band_resampling import shrink, textured
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import (
     Peak,
+    blur_px,
     correlation_surfaces,
     find_peak,
     gradient_magnitude,
@@ -79,6 +80,15 @@ def test_shrinking_averages_and_keeps_invalid_pixels_out() -> None:
     assert not small.valid[0, 0]
     assert small.valid.sum() == 15
     assert small.pixels[1, 1] == pytest.approx(pixels[2:4, 2:4].mean())
+
+
+def test_the_blur_of_an_image_with_a_masked_centre_is_that_of_its_edges() -> None:
+    blurred = cv2.GaussianBlur(textured_image(400, 320), (0, 0), 3.0)
+    valid = np.ones(blurred.shape, bool)
+    valid[70:250, 90:310] = False
+    of_edges = blur_px(Raster(np.where(valid, blurred, 0), valid))
+    assert blur_px(whole(blurred)) == pytest.approx(of_edges, rel=0.15)
+    assert blur_px(Raster(blurred, np.zeros_like(valid))) == 0.0
 
 
 def test_textured() -> None:
