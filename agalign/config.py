@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 
 from agalign.errors import ConfigurationError
 from agalign.values import choices
+from agalign.values.spectrum import band_key
 
 
 def names_in(text: str | None) -> tuple[str, ...]:
@@ -28,9 +29,9 @@ def names_in(text: str | None) -> tuple[str, ...]:
 def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
     """Return (band in lower case, reflectance) from 'Blue=0.51,NIR=0.49', or ("", reflectance) from one number.
 
-    Raises ConfigurationError for a reflectance that is not in (0, 1].
+    Raises ConfigurationError for a reflectance that is not in (0, 1], and for a second one of a band.
     """
-    result = []
+    result: list[tuple[str, float]] = []
     for part in names_in(text):
         name, _, number = part.rpartition("=")
         try:
@@ -39,7 +40,10 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
             value = 0.0
         if not 0 < value <= 1:
             raise ConfigurationError(f"--panel-albedo {text}: '{part}' is not a reflectance between 0 and 1")
-        result.append((name.strip().lower(), value))
+        band = name.strip().lower()
+        if any(band_key(band) == band_key(other) for other, _ in result):
+            raise ConfigurationError(f"--panel-albedo {text}: has two reflectances of {band or 'all bands'}")
+        result.append((band, value))
     return tuple(result)
 
 

@@ -18,7 +18,9 @@ from agalign.host.process_pool import ProcessPool, R, WorkerDiedError, open_pool
 from agalign.host.processes import usable_cores
 from agalign.pixels.radiometry import with_radiometry
 from agalign.rasters.product import Product
+from agalign.values.band_names import no_such_band
 from agalign.values.capture import Capture
+from agalign.values.spectrum import band_key
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ def select_captures(found: Sequence[Capture], write: WriteSettings, options: Run
     Raises ConfigurationError if no capture has what the settings ask for: the radiometry, the metadata for a
     georeference, or the bands for a product.
     """
+    _check_albedos(found, write)
     start, timeout_s = partial(import_module, __name__), options.timeout_s  # tasks do not wait for the imports
     readers = nullcontext() if timeout_s is None else open_pool(min(panel_readings.READERS, usable_cores()), 1, start)
     with readers as pool:
@@ -62,7 +65,7 @@ def _selected(
     found: Sequence[Capture], write: WriteSettings, options: RunOptions, examine: "_Examination"
 ) -> Selection:
     """Return the captures by what they show, those to align with their radiometry and georeference."""
-    albedos = dict(write.panel_albedo)
+    albedos = {band_key(name): value for name, value in write.panel_albedo}
     sky: list[SkyCapture] = []
     panels: list[PanelReading] = []
     captures = list(found)
@@ -77,6 +80,14 @@ def _selected(
         crs = footprint.utm_of_flights(captures)
         captures = [footprint.with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
     return Selection(sky, panels, captures, examine.abandoned)
+
+
+def _check_albedos(found: Sequence[Capture], write: WriteSettings) -> None:
+    """Raise NoSuchBandError for a band of --panel-albedo that no capture has."""
+    known = {band_key(band.name): band.name for capture in found for band in capture.bands}
+    for name, _ in write.panel_albedo if found else ():
+        if name and band_key(name) not in known:
+            raise no_such_band(found[0].reference.path, name, known.values(), by="--panel-albedo")
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:

@@ -190,14 +190,16 @@ def in_order(
             except (AgalignError, MemoryError):
                 raise
             except Exception as error:
-                # Dask reports that a task has ended its workers, and not why.
-                is_killed = timeout_s is not None and type(error).__name__ == "KilledWorker"
-                is_late = isinstance(error, TimeoutError) or is_killed
-                if if_late is None or not is_late:
+                if if_late is None or not (isinstance(error, TimeoutError) or _may_be_late(error, timeout_s)):
                     raise WorkerError(f"the flight cannot be learned: {failure_text(error)}") from error
                 value = if_late(tasks[following])
             yield value
             following += 1
+
+
+def _may_be_late(error: Exception, timeout_s: float | None) -> bool:
+    """Return True if Dask reports that a task with a time limit has ended its workers: it does not say why."""
+    return timeout_s is not None and type(error).__name__ == "KilledWorker"
 
 
 def failure_text(error: Exception, timeout_s: float | None = None) -> str:
@@ -214,6 +216,8 @@ def failure_text(error: Exception, timeout_s: float | None = None) -> str:
             return "out of memory; try again with fewer --jobs, or with more memory"
         case AgalignError():
             return str(error)
+    if _may_be_late(error, timeout_s):
+        return f"its workers were ended, after {timeout_s:g} s (--timeout) or for memory"
     first_line = next(iter(str(error).splitlines()), type(error).__name__)
     if isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed":
         return f"the cluster lost it ({first_line}); {run_again}"

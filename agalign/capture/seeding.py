@@ -51,7 +51,7 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
             return Issue(NO_SUCH_SEED, detail="match")
         matrices = {"match": result}
     elif force not in (None, "structure", *matrices):  # the peaks of other kinds are structure
-        return Issue(NO_SUCH_SEED, detail=force)
+        return Issue(NO_SUCH_SEED, detail=str(force))
     best = best_seed(pair, matrices, force)
     # A mapping by the flight or the user or a forced seed excludes other positions.
     is_given = settings.force is not None or pair.has_rig or "user" in pair.seed_matrices

@@ -177,7 +177,7 @@ def _onto(
     return conclude(totals, target, terminal)
 
 
-onto = Command(
+onto = _command(
     _onto,
     {
         "Output": "out interpolation format compression",

@@ -1,5 +1,6 @@
 """The command `agalign info`: the captures of a folder, or the contents of a model."""
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -113,12 +114,13 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
 
 def _unreadable_files(flight: "FolderScan") -> dict[str, list[str]]:
     """Return the unreadable files of each capture by label: those of its bands, and others with names that begin with
-    the capture's name.
+    the capture's name, and not with a longer number.
     """
     result: dict[str, list[str]] = defaultdict(list)
     for path in (p.path for p in flight.problems if isinstance(p.error, UnreadableFileError)):
         in_folder = [c for c in flight.captures if c.reference.path.parent == path.parent]
-        candidates = [c for c in in_folder if path.name.startswith(c.name) or _is_of(path, c)]
+        named = [c for c in in_folder if re.match(rf"{re.escape(c.name)}(?!\d)", path.name)]
+        candidates = named + [c for c in in_folder if _is_of(path, c)]
         if candidates:
             result[max(candidates, key=lambda c: len(c.name)).label].append(path.name)
     return result

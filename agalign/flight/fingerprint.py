@@ -17,6 +17,7 @@ from agalign.flight.groups import flight_camera
 from agalign.host.files import open_regular
 from agalign.values.capture import Capture
 from agalign.values.lens import Lens
+from agalign.values.radiometric_errors import BRIGHT
 
 HashInput = str | int | float | bool | None | np.ndarray | Lens | Sequence["HashInput"]
 
@@ -58,7 +59,8 @@ def render_fingerprint(capture: Capture, write: WriteSettings, check: CheckSetti
     for b in capture.stack_bands:
         calibration: HashInput = None
         if b.radiometry is not None:
-            errors = [(e.name, e.std_percent, e.state) for e in b.radiometry.errors]
+            # That of the pixels is not known before they are read, and they are compared by themselves.
+            errors = [(e.name, e.std_percent, e.state) for e in b.radiometry.errors if e.name != BRIGHT]
             calibration = b.radiometry.quantity, b.radiometry.gain, errors
         georeference = None if b.georeference is None else b.georeference.transform
         facts.append((b.name, calibration, georeference))

@@ -22,6 +22,7 @@ from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
 from agalign.values.radiometric_errors import LIGHT_SENSOR, PANEL_AND_SENSOR, contradiction, panel_errors
 from agalign.values.radiometry import RadiometricError, RadiometrySource, ReflectanceFactor
+from agalign.values.spectrum import band_key
 
 R = TypeVar("R")
 Albedos = Mapping[str, float]
@@ -454,7 +455,7 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
         if detected is not None and detected.is_ambiguous:
             problem = "several squares of different brightness may be the panel; none is used"
         band = replace(band, panel=panel)
-    albedo = albedos.get(band.name.lower(), albedos.get("", None if panel is None else panel.albedo))
+    albedo = albedos.get(band_key(band.name), albedos.get("", None if panel is None else panel.albedo))
     if panel is None or not panel.corners_px:
         return BandReading(band, albedo, problem=problem)
     try:

@@ -30,6 +30,7 @@ def file_problem(path: Path, part: FilePart, known: Collection[str] = ()) -> str
 
     The size is always compared, and the checksum unless the state of the file is among the `known` ones.
     """
+    again = "run 'agalign indices' again" if part.kind == "index" else "run again"
     try:
         with open_regular(path) as file:
             status = os.fstat(file.fileno())
@@ -37,9 +38,8 @@ def file_problem(path: Path, part: FilePart, known: Collection[str] = ()) -> str
             if status.st_size == part.bytes and (is_known or _checksum(file) == part.sha256):
                 return ""
     except OSError as error:
-        again = "run 'agalign indices' again" if part.kind == "index" else "run again"
         return f"{path}: cannot be read ({error.strerror or error}); {again}"
-    return f"{path}: is not what was written; delete it and run again"
+    return f"{path}: is not what was written; delete it and {again}"
 
 
 def _checksum(file: BufferedReader) -> str:

@@ -56,10 +56,14 @@ def contradiction(name: str, *values: float) -> RadiometricError:
     return RadiometricError(name, 100 * (math.sqrt(max(values) / min(values)) - 1), "contradicted")
 
 
+BRIGHT = "reflectance above 1"
+"""Name of the error that only the pixels tell."""
+
+
 def too_bright(median: float) -> RadiometricError:
     """Return the error of a band whose median reflectance is above 1, which only a wrong panel or sensor explains."""
     max_usual = 0.5  # of vegetation, soil, water and roofs
-    return contradiction("reflectance above 1", max_usual, median)
+    return contradiction(BRIGHT, max_usual, median)
 
 
 def panel_errors(spread: float, age_s: float | None) -> tuple[RadiometricError, ...]:

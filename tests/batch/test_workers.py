@@ -22,7 +22,15 @@ from agalign.batch import workers
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports, run_flight
-from agalign.batch.workers import DaskExecutor, RunTasks, dask_executor, in_order, on_executor, open_workers
+from agalign.batch.workers import (
+    DaskExecutor,
+    RunTasks,
+    dask_executor,
+    failure_text,
+    in_order,
+    on_executor,
+    open_workers,
+)
 from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
@@ -143,6 +151,12 @@ def test_a_capture_that_takes_too_long_ends_its_process_on_a_cluster() -> None:
     call = f"_on_worker({agalign.__version__!r}, time.sleep, 60, timeout_s=0.3)"
     code = f"import time; from agalign.batch.workers import _on_worker; {call}"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 75
+
+
+def test_a_time_limit_is_named_where_a_cluster_does_not_say_why_a_task_ended_its_workers() -> None:
+    killed = type("KilledWorker", (Exception,), {"__module__": "distributed.scheduler"})("on 4 workers")
+    assert failure_text(killed, 60.0) == "its workers were ended, after 60 s (--timeout) or for memory"
+    assert failure_text(killed).startswith("the cluster lost it (on 4 workers)")
 
 
 def client(versions: dict[str, object], status: str = "running", executor: object = None) -> mock.Mock:

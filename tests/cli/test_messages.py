@@ -217,6 +217,14 @@ def test_an_unreadable_file_is_shown_as_missing(tmp_path: Path) -> None:
     assert capture["unreadable_files"] == ["IMG_0001_nir.tif"]
 
 
+def test_an_unreadable_file_of_another_number_is_not_of_a_capture(tmp_path: Path) -> None:
+    for name in ("f1", "f10"):
+        write_capture(tmp_path, "red", "green", name=name)
+    (tmp_path / "f10_green.tif").write_bytes(b"II*\0broken")
+    (capture,) = json.loads(agalign_here("info", tmp_path, "--json").stdout)["captures"]
+    assert (capture["label"], capture["unreadable_files"]) == ("f1", [])
+
+
 def test_info_begins_with_the_cameras(flight: Path) -> None:
     done = agalign_here("info", flight)
     text = " ".join(done.stdout.split())

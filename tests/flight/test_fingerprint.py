@@ -17,6 +17,7 @@ from agalign.flight.fingerprint import (
     render_fingerprint,
 )
 from agalign.values.capture import Capture, Georeference
+from agalign.values.radiometric_errors import PANEL, too_bright
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +68,16 @@ def test_facts_of_the_products_change_their_fingerprint_alone(capture: Capture) 
     assert len({products for _, products in found}) == len(found)
     # Each index is a file of its own.
     assert fingerprints(capture, Settings(write=WriteSettings(indices=("ndvi",)))) == found[0]
+
+
+def test_what_only_the_pixels_tell_does_not_change_the_fingerprint(capture: Capture) -> None:
+    """A run compares captures with earlier results before it reads their pixels, which it compares themselves."""
+    radiometry = capture.bands[0].radiometry
+    known, bright = (
+        changed_band(capture, radiometry=replace(radiometry, errors=(*radiometry.errors, error)))
+        for error in (PANEL, too_bright(1.3))
+    )
+    assert fingerprints(bright) == fingerprints(capture) != fingerprints(known)
 
 
 def test_contents_and_times_of_files_are_compared_and_the_flight_is_not(flight: Path, tmp_path: Path) -> None:

@@ -87,7 +87,8 @@ def test_no_command_uses_a_file_that_was_changed(
     folder = run / "0000SET" / "000"
     path, other = (folder / PRODUCTS[product].format(name) for name in ("IMG_0001", "IMG_0002"))
     change(path, other)
-    said = f"{path}: is not what was written; delete it and run again"
+    again = "run 'agalign indices' again" if product == "index" else "run again"
+    said = f"{path}: is not what was written; delete it and {again}"
     done = agalign_here("verify", run)
     assert (done.returncode, said in done.stderr) == (3, True)
     done = agalign_here("report", run)

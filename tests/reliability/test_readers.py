@@ -152,5 +152,6 @@ def test_any_albedo(text: str) -> None:
     said = refusal(albedos, text)
     if said is None:
         assert all(0 < value <= 1 for _, value in albedos(text))
+        assert len({name for name, _ in albedos(text)}) == len(albedos(text))
     else:
         assert "--panel-albedo" in said

@@ -17,7 +17,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 import agalign
-from agalign.config import RunOptions, WriteSettings
+from agalign.config import RunOptions, WriteSettings, albedos
 from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.panel_readings import BandReading, PanelReading, missing_panel, read_panel, with_panels
 from agalign.host.files import PANELS_FILE, SKY_FILE
@@ -200,6 +200,26 @@ def test_outputs_of_a_panel_are_removed_with_a_line(between_panels: Path, tmp_pa
 def test_without_a_panel_none_is_made_up(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(agalign.ConfigurationError, match="--panel-albedo"):
         agalign.align_folder(flight, tmp_path, settings=seeded(radiometry="panel"))
+
+
+def test_a_reflectance_is_used_or_refused(between_panels: Path, tmp_path: Path) -> None:
+    panel = with_panels(agalign.discover(between_panels).captures)[0]
+    read = read_panel(panel, {"rededge": 0.25, "": 0.5})
+    assert {b.band.name: b.albedo for b in read.bands} == dict.fromkeys(("Blue", "Green", "Red", "NIR"), 0.5) | {
+        "Red edge": 0.25
+    }
+
+    def aligned(given: str) -> None:
+        write = WriteSettings(radiometry="panel", panel_albedo=albedos(given))
+        agalign.align_folder(between_panels, tmp_path, settings=agalign.Settings(write=write))
+
+    for given, said in (
+        ("0.5,Bleu=0.49", r"no band 'bleu', as --panel-albedo asks \(did you mean 'Blue'\?\)"),
+        ("0.51,0.49", "has two reflectances of all bands"),
+        ("RedEdge=0.5,red edge=0.4", "has two reflectances of red edge"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            aligned(given)
 
 
 def files_of(out: Path) -> dict[str, tuple[bytes, int]]:
