@@ -43,7 +43,7 @@ from agalign.records.run_record import Finished, ProblemKind, RunPart, RunState,
 from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages, pages_exist, write_pages
 from agalign.report.pair_totals import PairTotals
-from agalign.report.panels_and_sky import panel_picture, write_panels, write_sky
+from agalign.report.panel_and_sky_files import panel_picture, write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid

@@ -22,7 +22,7 @@ from agalign.flight.panel_readings import (
 )
 from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
-from agalign.report.panels_and_sky import write_panels
+from agalign.report.panel_and_sky_files import write_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position
 from agalign.values.radiometry import Quantity, Radiometry, ReflectanceFactor
 

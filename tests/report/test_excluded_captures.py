@@ -25,7 +25,7 @@ from agalign.host.own_files import is_own_file
 from agalign.records import cautions as run_cautions
 from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES, read_panels_and_sky
 from agalign.report.pages import write_pages
-from agalign.report.panels_and_sky import _tile
+from agalign.report.panel_and_sky_files import _tile
 from agalign.values.capture import Band
 
 from ..conftest import SUN, Shared, read_json, seeded
