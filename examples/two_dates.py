@@ -1,4 +1,4 @@
-"""Align a mosaic to an earlier one and write the difference of their bands.
+"""Align a mosaic to an earlier one in the same CRS, and write the difference of a band: green if they have it.
 
 python examples/two_dates.py EARLIER.tif LATER.tif CHANGE.tif
 """
@@ -17,7 +17,10 @@ if len(sys.argv) != 4:
 earlier, later, target = map(Path, sys.argv[1:4])
 with tempfile.TemporaryDirectory() as folder:
     (report,) = agalign.onto(earlier, [later], folder)
-    moving = report.sidecar.bands[1]
+    name, bands = report.sidecar.reference.band.removeprefix(f"{earlier.stem} "), report.sidecar.bands[1:]
+    moving = next((band for band in bands if band.band == name or len(bands) == 1), None)
+    if moving is None:
+        sys.exit(f"{later} has no band {name}, to which it was aligned")
     if moving.status != "aligned":
         sys.exit(f"{later} cannot be aligned to {earlier}: {moving.reason}")
     with rasterio.open(earlier) as one, rasterio.open(later) as other:
