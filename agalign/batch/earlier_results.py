@@ -81,11 +81,22 @@ class EarlierResults:
         return changed
 
 
+Step = Literal["nothing", "keep", "render", "estimate"]
+PROCESSING: Sequence[Step] = "estimate", "render"
+"""The steps that process a capture."""
+_IN_WORDS: Mapping[Step, str] = {
+    "nothing": "kept from an earlier run",
+    "keep": "kept from an earlier run, as input files are missing or damaged now",
+    "render": "to be rendered",
+    "estimate": "to be aligned",
+}
+
+
 @dataclass(frozen=True)
 class Remaining:
     """What remains to be done for a capture."""
 
-    step: Literal["nothing", "keep", "render", "estimate"]
+    step: Step
     """The first step; rendering follows the estimation. `keep`: files of an earlier result are lost, so that this run
     would replace it by one with fewer bands.
     """
@@ -95,6 +106,19 @@ class Remaining:
     """The result of the earlier command, without its tables, if the estimation is kept."""
     why_kept: str = ""
     """The lost files and the remedy, for the step `keep`."""
+
+    @property
+    def is_processed(self) -> bool:
+        """True if a run processes the capture, and does not keep it."""
+        return self.step in PROCESSING
+
+    @property
+    def in_words(self) -> str:
+        """What a run does with the capture, and which changes are the reason."""
+        if not self.changed:
+            return _IN_WORDS[self.step]
+        again = "estimated" if self.step == "estimate" else "rendered"
+        return f"to be {again} again; changed since: {', '.join(self.changed)}"
 
 
 def remaining(

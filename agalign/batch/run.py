@@ -14,7 +14,7 @@ from typing import Self
 from agalign.batch import earlier_results, output_files
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
-from agalign.batch.earlier_results import EarlierResults, Remaining
+from agalign.batch.earlier_results import PROCESSING, EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.model_files import ModelFiles
 from agalign.batch.selection import Selection, select_captures
@@ -48,16 +48,8 @@ from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 
-_PLANNED = {
-    "nothing": "kept from an earlier run",
-    "keep": "kept from an earlier run, as input files are missing or damaged now",
-    "render": "to be rendered",
-    "estimate": "to be aligned",
-}
 _SAVED_EVERY_S = 60.0
 """Time between two writings of the run record during a run."""
-_AGAIN = {"render": "rendered", "estimate": "estimated"}
-"""What is done, by step of `Remaining`."""
 _Flight = tuple[list[Capture], Path | None]
 """Captures of a flight, and the file of its model."""
 
@@ -166,10 +158,7 @@ def plan_run(
     states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
     states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}
     for capture in selection.captures:
-        left = run.remaining(capture)
-        states[capture.label] = _PLANNED[left.step]
-        if left.changed:
-            states[capture.label] = f"to be {_AGAIN[left.step]} again; changed since: {', '.join(left.changed)}"
+        states[capture.label] = run.remaining(capture).in_words
     return {c.label: states[c.label] for c in flight.captures}
 
 
@@ -207,15 +196,15 @@ class _Plan:
     @property
     def number(self) -> int:
         """Number of captures that are processed."""
-        return sum(one.step in ("render", "estimate") for one in self.left.values())
+        return sum(one.is_processed for one in self.left.values())
 
     def changes(self) -> Iterator[str]:
         """Yield, in words, which finished captures are processed again, and why."""
-        for step in ("estimate", "render"):
+        for step in PROCESSING:
             again = [one.changed for one in self.left.values() if one.step == step and one.changed]
             if again:
-                names = ", ".join(dict.fromkeys(name for changed in again for name in changed))
-                yield f"{counted(len(again), 'finished capture')} to be {_AGAIN[step]} again; changed since: {names}"
+                changed = tuple(dict.fromkeys(name for names in again for name in names))
+                yield f"{counted(len(again), 'finished capture')} {Remaining(step, changed).in_words}"
 
 
 @dataclass(frozen=True)
@@ -342,7 +331,7 @@ class _FlightRun:
                 run_tasks = stack.enter_context(workers(*of_tasks))
             for capture, model, rendering in renderings:
                 one = plan.left[capture.label]
-                if one.step in ("nothing", "keep"):
+                if not one.is_processed:
                     yield self._kept(capture, one)
                     continue
                 is_estimated = one.step == "render"
