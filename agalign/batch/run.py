@@ -167,7 +167,9 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     """Write the run record at the beginning of a run, and with the pages at its end, also after an interruption."""
     began, earlier = time.monotonic(), last_record(run.out)
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
-    record.file_states = {} if earlier is None else dict(earlier.file_states)
+    states = {} if earlier is None else earlier.file_states
+    # A file that appears later in the place of a deleted sidecar is not of agalign.
+    record.file_states = {label: one for label, one in states.items() if (run.out / f"{label}.json").exists()}
     record.other_inputs = earlier_results.labels_of_other_inputs(earlier, record)
     record.not_in_input = list(earlier_results.results_not_in_input(run.flight, run.out, record.other_inputs))
     used = {band.path for capture in run.flight.captures for band in capture.bands}

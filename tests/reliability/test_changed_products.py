@@ -151,6 +151,19 @@ def test_a_run_reads_only_files_that_changed_since_the_last_one(
 
 
 @pytest.mark.slow
+def test_a_deleted_result_is_forgotten_so_that_a_later_file_in_its_place_is_the_user_s(flight: Path, run: Path) -> None:
+    first, second = sorted(file_states(run))
+    for path in (run / second).parent.glob("IMG_0002*"):
+        path.unlink()
+    assert agalign_here(flight, "-o", run, *OPTIONS, "--exclude", "IMG_0002_*").returncode == 0
+    assert [*file_states(run)] == [first]
+    mine = run / f"{second}.json"
+    mine.write_text('{"schema": "mine"}')
+    done = agalign_here(flight, "-o", run, *OPTIONS)
+    assert (done.returncode, mine.read_text()) == (2, '{"schema": "mine"}')
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("copied", [False, True], ids=["exchanged", "copied"])
 def test_no_command_uses_the_sidecar_of_another_capture(
     flight: Path, run: Path, tmp_path: Path, *, copied: bool
