@@ -164,7 +164,8 @@ class Level:
         """Draw up to `count` keypoints with patches in the valid area of I and of at least one I'.
 
         Returns the keypoints and (N, bands) True for each I' that contains the patch; keypoints in most bands come
-        first. The orientation is uniform in [0, 2 pi], log2(scale / spacing_px) is uniform in [0, octaves] (paper,
+        first. An I' that contains few of these, as it shows another part of I, has up to a quarter of `count` in
+        addition. The orientation is uniform in [0, 2 pi], log2(scale / spacing_px) is uniform in [0, octaves] (paper,
         Sec. 5.3).
         """
         tries_per_keypoint = 4  # keypoints are drawn in excess, because patches that leave the valid area are rejected
@@ -176,9 +177,14 @@ class Level:
         inside = torch.stack([band.overlaps(keypoints) for band in self.bands], dim=1)
         inside &= (footprint_radius(keypoints.scale) + 1 < pool.max_radius_px[rows])[:, None]
         bands = inside.sum(dim=1)
-        order = torch.argsort(bands, descending=True, stable=True)[:count]
+        order = torch.argsort(bands, descending=True, stable=True)
         order = order[bands[order] > 0]
-        return keypoints[order], inside[order]
+        chosen, others = order[:count], order[count:]
+        for of_band in inside.T:
+            missing = max(0, count // 4 - int(of_band[chosen].sum()))
+            added = others[of_band[others]][:missing]
+            chosen, others = torch.cat([chosen, added]), others[~torch.isin(others, added)]
+        return keypoints[chosen], inside[chosen]
 
 
 def make_level_image(raster: Raster, scale: float, device: torch.device) -> LevelImage:

@@ -129,6 +129,17 @@ def test_keypoints_in_most_images_come_first() -> None:
         torch.testing.assert_close(inside[:, k], band.overlaps(p))
 
 
+def test_an_image_of_another_part_has_keypoints_of_its_own() -> None:
+    left, right = (Raster(MOVING.pixels, HOLE & part) for part in (np.arange(320) < 180, np.arange(320) > 180))
+    state = JointState(JointSettings(device="cpu"), lambda *_: None)
+    level = make_level(state, FIXED, [MovingImage(one, np.eye(3)) for one in (left, left, right)], 1.0)
+    p, inside = level.draw(level.anywhere, 100, 0.3)
+    assert inside.sum(dim=0).tolist() == [100, 100, 25]
+    assert len(p) == 125
+    for k, band in enumerate(level.bands):
+        torch.testing.assert_close(inside[:, k], band.overlaps(p))
+
+
 def test_patches_are_displaced_by_the_local_value_of_the_field_and_sampled_through_the_lens() -> None:
     """The rig's field is in px of the full image; at half the resolution displacements are half as long."""
     model = Lens(300.0, 300.0, 158.0, 121.0, (-0.1, 0.15, 0.0004, -0.0003, -0.03))
