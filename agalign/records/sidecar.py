@@ -556,7 +556,7 @@ class Sidecar(_Part):
     )
 
     schema_: Annotated[Literal["agalign/3"], Field(alias="schema")] = "agalign/3"
-    """Version of the format."""
+    """Version of the format, `agalign/3`; later ones may differ."""
     agalign: Name
     """Version of the program."""
     capture: RelativeFile
