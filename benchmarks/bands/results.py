@@ -83,8 +83,8 @@ def table_of(result: Result) -> str:
 
 
 def comparison(results: Sequence[Result], sets: Mapping[str, Any]) -> Iterable[TableRow]:
-    """Yield the rows of methods in each table: of all sets, of unchanged images of drone cameras, with a limit for the
-    ratings of methods, and by set for OpenDroneMap.
+    """Yield the rows of methods in each table: of all sets, of drone cameras, with a limit for the ratings of methods,
+    and by set for OpenDroneMap.
 
     The program corrects the lenses of a capture by itself, and OpenDroneMap aligns raw files: what they make of the
     original files is compared with what other methods make of corrected images.
@@ -97,7 +97,13 @@ def comparison(results: Sequence[Result], sets: Mapping[str, Any]) -> Iterable[T
     drone_cameras = {name for name, description in sets.items() if "ties" in _first_pair(description)}
     of_drones = [r for r in results if r.variant == AS_IT_IS and r.set in drone_cameras]
     pairs_of_drones = [r for r in of_drones if r.method not in WHOLE]
-    prefixes = {"comparison": [*used, *with_predicted(used)], "drone cameras": pairs_of_drones, "limits": limited}
+    rated = [*used, *with_predicted(used), *limited]
+    copies_of_drones = [r for r in rated if table_of(r) == COPIES and r.set in drone_cameras]
+    prefixes = {
+        "comparison": [*used, *with_predicted(used)],
+        "drone cameras": [*pairs_of_drones, *copies_of_drones],
+        "limits": limited,
+    }
     for prefix, some in prefixes.items():
         groups: dict[tuple[str, str], list[Result]] = {}
         for r in some:

@@ -79,14 +79,14 @@ def test_the_comparison_of_the_readme() -> None:
     (body,) = re.findall(r"^\| \| 45 pairs .*\n\|[-|]+\|\n((?:\|.+\|\n)+)", text, re.MULTILINE)
     for row in body.splitlines():
         name, wrong, median_px, *of_copies = (cell.strip() for cell in row.strip("|").split("|"))
-        originals, degraded = "comparison, originals with tags", "comparison, degraded copies"
+        originals, degraded = "comparison, originals with tags", "drone cameras, degraded copies"
         quoted = [(wrong, f"{originals} / {name} / wrong"), (median_px, f"{originals} / {name} / median error")]
         copies, limited = of_copies
         alone, _, with_predicted = copies.partition("; with predicted ")
         for cell, facts in (
             (alone, f"{degraded} / {name}"),
             (with_predicted, f"{degraded} / {name}, with predicted"),
-            (limited, f"limits, degraded copies / {name}, with a limit"),
+            (limited, f"{degraded} / {name}, with a limit"),
         ):
             assert bool(cell) == (f"{facts} / accepted" in figures()), facts
             if cell:
