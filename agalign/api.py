@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prin
 from agalign.batch.capture_report import CaptureReport, FlightReports
 from agalign.batch.capture_task import Task, process_capture, quiet
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.batch.output_files import refuse_folder_of_images, refuse_results_elsewhere
+from agalign.batch.output_files import refuse_results_elsewhere
 from agalign.batch.run import Listener, run_flight
 from agalign.batch.selection import select_captures
 from agalign.cameras.discover import FolderScan, discover, mosaics_onto
@@ -236,8 +236,6 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     [('Green', 'reference'), ('NIR', 'aligned')]
     """
     settings = settings or Settings()
-    if capture.root is not None:
-        refuse_folder_of_images(Path(out), capture.root)
     check_indices([capture], settings.write)
     selection = select_captures([capture], settings.write, RunOptions())
     if not selection.captures:

@@ -179,12 +179,6 @@ def _sizes(parts: Iterable[FilePart], folder: Path) -> dict[Path, int]:
     return {folder / part.file: part.bytes for part in parts}
 
 
-def refuse_folder_of_images(out: Path, folder: Path) -> None:
-    """Raise ConfigurationError if the output folder is the folder of the images."""
-    if out.resolve() == folder.resolve():
-        raise ConfigurationError(f"{out}: is the folder of the images; choose another output folder with -o")
-
-
 def refuse_results_elsewhere(captures: Sequence[Capture], out: Path, read: ReadSidecar = read_with_change) -> None:
     """Raise ConfigurationError if another place of the output folder has the result of a capture, as of a run on the
     folder above, or one of the same name by a version with another schema.

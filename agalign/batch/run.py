@@ -228,7 +228,8 @@ class _FlightRun:
             raise ConfigurationError(f"{problem}, or choose another output folder with -o")
         choose_device(self.settings.joint.device)
         check_indices(self.flight.captures, self.settings.write)
-        output_files.refuse_folder_of_images(self.out, self.flight.folder)
+        if self.out.resolve() == self.flight.folder.resolve():
+            raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         earlier = last_record(self.out)
         self.results.file_states.update({} if earlier is None else earlier.file_states)
         output_files.refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, self.results)

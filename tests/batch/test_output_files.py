@@ -142,11 +142,3 @@ def test_what_is_there_decides(
 def test_the_cases_cover_every_state() -> None:
     (mark,) = (m for m in test_what_is_there_decides.pytestmark if m.name == "parametrize")
     assert {state for _, state, *_ in mark.args[1]} == {*State}
-
-
-def test_a_single_capture_is_not_written_among_its_images(case: Case) -> None:
-    capture = case[1][0]
-    before = sorted(capture.root.rglob("*"))
-    with pytest.raises(agalign.ConfigurationError, match="is the folder of the images"):
-        agalign.align_capture(capture, capture.root, settings=seeded("identity"))
-    assert sorted(capture.root.rglob("*")) == before
