@@ -1,5 +1,6 @@
 """A camera counts from 1970 until its clock is set: all files have that as an unknown time."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -26,7 +27,8 @@ def test_a_clock_that_was_not_set_is_no_time_in_any_file(flight: Path, tmp_path:
     agalign.align_folder(folder, out, settings=seeded("rig"))
     texts = [path for path in out.rglob("*") if path.suffix in (".json", ".geojson", ".csv")]
     assert len(texts) == 5
-    assert [path.name for path in texts if "1970" in path.read_text()] == []
+    # The date, not "1970" alone: seconds and matrices of a sidecar may have these digits.
+    assert [path.name for path in texts if re.search("1970[-:]01", path.read_text())] == []
     assert read_json(out / f"{capture.label}.json")["captured_at"] == ""
     rasters = [path for path in out.rglob("*.tif") if b"1970:01:01" in path.read_bytes()]
     assert rasters == []
@@ -34,7 +36,7 @@ def test_a_clock_that_was_not_set_is_no_time_in_any_file(flight: Path, tmp_path:
         assert "TIFFTAG_DATETIME" not in stack.tags()
     page = (out / "index.html").read_text()
     assert '"captured_at":""' in page
-    assert "1970" not in agalign_here("info", folder, "--json").stdout
+    assert "1970-01" not in agalign_here("info", folder, "--json").stdout
     # The same captures are kept.
     assert {report.state for report in agalign.align_folder(folder, out, settings=seeded("rig"))} == {"kept"}
     assert [row["status"] for row in table_in(out / "summary.csv")] == ["seed_only"] * 8
