@@ -95,21 +95,24 @@ def _hann_window(height: int, width: int) -> FloatImage:
 
 def forward_transform(planes: Field) -> Field:
     """Return the Fourier transform of planes (..., height, width)."""
-    return _each_plane(cv2.dft, planes)
+    return _each_plane(lambda plane, result: cv2.dft(plane, result), planes)
 
 
 def inverse_transform(spectra: Field) -> Field:
     """Return the inverse Fourier transform of spectra (..., height, width)."""
-    return _each_plane(lambda plane: cv2.idft(plane, flags=cv2.DFT_SCALE), spectra)
+    return _each_plane(lambda plane, result: cv2.idft(plane, result, cv2.DFT_SCALE), spectra)
 
 
-def _each_plane(transform: Callable[[FloatImage], FloatImage], fields: Field) -> Field:
-    """Apply a Fourier transform of OpenCV, 2 to 3 times faster than SciPy's, to each plane (..., height, width)."""
+def _each_plane(transform: Callable[[FloatImage, FloatImage], object], fields: Field) -> Field:
+    """Apply a Fourier transform of OpenCV, 2 to 3 times faster than SciPy's, to each plane (..., height, width).
+
+    `transform` writes that of its first argument into the second.
+    """
     height, width = fields.shape[-2:]
     planes = np.ascontiguousarray(fields).view(np.float32).reshape(-1, height, width, 2)
     result = np.empty_like(planes)
     for plane, transformed in zip(planes, result, strict=True):
-        transformed[:] = transform(plane)
+        transform(plane, transformed)
     return result.view(np.complex64).reshape(fields.shape)
 
 
