@@ -146,17 +146,18 @@ def peak_positions(cross: Field, near_px: NDArray[np.float64]) -> NDArray[np.flo
     result = near_px.copy()
     offset = np.array([-1.0, 0.0, 1.0])
     for step in (0.5, 0.25):  # spacings in px
-        x, y = (result[:, axis, None] + step * offset for axis in (0, 1))
-        rows = _fourier_basis(y, height) @ cross
-        patches = (rows @ _fourier_basis(x, width).transpose(0, 2, 1)).real
+        x, y = result.T
+        rows = _fourier_basis(y, step * offset, height) @ cross
+        patches = (rows @ _fourier_basis(x, step * offset, width).transpose(0, 2, 1)).real
         result += step * paraboloid_peaks(patches.astype(np.float64))
     return result
 
 
-def _fourier_basis(positions_px: NDArray[np.float64], length: int) -> Field:
-    """Return the basis of an inverse transform at positions (n, m), (n, m, length)."""
-    frequencies = np.fft.fftfreq(length)
-    return np.asarray(np.exp(2j * np.pi * positions_px[..., None] * frequencies), np.complex64)
+def _fourier_basis(positions_px: NDArray[np.float64], offsets_px: NDArray[np.float64], length: int) -> Field:
+    """Return the basis (n, m, length) of an inverse transform at positions (n,), each with all offsets (m,)."""
+    frequencies = 2j * np.pi * np.fft.fftfreq(length)
+    at, by = (np.exp(values[:, None] * frequencies) for values in (positions_px, offsets_px))
+    return (at[:, None] * by).astype(np.complex64)
 
 
 def paraboloid_peaks(patches: NDArray[np.float64]) -> NDArray[np.float64]:
