@@ -73,8 +73,9 @@ class FixedWindows:
         # From the complete grid: windows that drop out later must not change the column and row of the others.
         cells = np.stack([np.unique(along, return_inverse=True)[1] for along in origins.T], axis=1)
         inside = (origins + self.side <= (width, height)).all(axis=1)
-        is_strong, windows = self._strong(structure, self.valid, origins[inside])
-        self.origins, self.cells = origins[inside][is_strong], cells[inside][is_strong]
+        origins, cells = origins[inside], cells[inside]
+        is_strong, windows = self._strong(structure, self.valid, origins, self._valid_counts(self.valid, origins))
+        self.origins, self.cells = origins[is_strong], cells[is_strong]
         self.centres_px = self.origins + (self.side - 1) / 2
         self.spectra = windowed_spectra(windows)
 
@@ -101,17 +102,17 @@ class FixedWindows:
         and with it the weight of the shift. Windows with too few are omitted.
         """
         mask, structure = _inside(moving.valid), structure_field(moving)
-        both = self.valid & mask
+        counts = self._valid_counts(mask, self.origins)
+        share = self._valid_counts(self.valid & mask, self.origins) / self.side**2
+        with_pixels = np.flatnonzero(share >= self.min_valid)
         at_once = 64  # windows that fit into the CPU's cache: a quarter faster
         parts = [(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))]
-        for first in range(0, len(self.origins), at_once):
-            rows = np.arange(first, min(first + at_once, len(self.origins)))
-            share = self._cut(both, self.origins[rows]).mean(axis=(1, 2))
-            rows, share = rows[share >= self.min_valid], share[share >= self.min_valid]
-            is_strong, windows = self._strong(structure, mask, self.origins[rows])
-            rows, share = rows[is_strong], share[is_strong]
+        for first in range(0, len(with_pixels), at_once):
+            rows = with_pixels[first : first + at_once]
+            is_strong, windows = self._strong(structure, mask, self.origins[rows], counts[rows])
+            rows = rows[is_strong]
             cross = whitened_cross_spectra(self.spectra[rows], windowed_spectra(windows))
-            masked = share < 1 - _MAX_IGNORED_SHARE
+            masked = share[rows] < 1 - _MAX_IGNORED_SHARE
             if masked.any():
                 fixed, other = (self._cut(valid, self.origins[rows[masked]]) for valid in (self.valid, mask))
                 cross[masked] = _relative_to_overlap(cross[masked], fixed, other)
@@ -126,24 +127,28 @@ class FixedWindows:
         x, y = origins.T
         return np.asarray(sliding_window_view(image, (self.side, self.side))[y, x])
 
-    def _strong(self, field: Field, valid: Mask, origins: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Field]:
+    def _valid_counts(self, valid: Mask, origins: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the number (n,) of valid pixels in the windows with these origins."""
+        sums, (x, y), side = cv2.integral(valid.view(np.uint8)), origins.T, self.side
+        return np.asarray(sums[y + side, x + side] - sums[y, x + side] - sums[y + side, x] + sums[y, x], np.int64)
+
+    def _strong(
+        self, field: Field, valid: Mask, origins: NDArray[np.int64], counts: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_], Field]:
         """Return True (n,) for windows with structure, and these windows (m, side, side) minus their means.
 
         The mean orientation of a row crop is the same everywhere and contains no information on the position. Mean and
-        amplitude are those of the valid pixels; the others are 0.
+        amplitude are those of the valid pixels, of which the windows have `counts` (n,); the others are 0.
         """
-        windows, count = self._cut(field, origins), np.full(len(origins), self.side**2)
-        known = None if valid.all() else self._cut(valid, origins)
-        if known is not None:
-            count = np.maximum(np.count_nonzero(known, axis=(1, 2)), 1)
+        windows, counts = self._cut(field, origins), np.maximum(counts, 1)
         min_amplitude = 0.05  # of the structure field, at most 1; weaker windows contain only noise
-        amplitude = np.abs(windows[:, ::2, ::2]).mean(axis=(1, 2)) * (self.side**2 / count)
-        is_strong = (amplitude >= min_amplitude) & (count >= self.min_valid * self.side**2)
+        amplitude = np.abs(windows[:, ::2, ::2]).mean(axis=(1, 2)) * (self.side**2 / counts)
+        is_strong = (amplitude >= min_amplitude) & (counts >= self.min_valid * self.side**2)
         if not is_strong.all():
-            windows, count = windows[is_strong], count[is_strong]
-        windows -= (windows.sum(axis=(1, 2)) / count)[:, None, None]
-        if known is not None:
-            windows *= known[is_strong]
+            windows, counts, origins = windows[is_strong], counts[is_strong], origins[is_strong]
+        windows -= (windows.sum(axis=(1, 2)) / counts)[:, None, None]
+        is_partly_valid = counts < self.side**2
+        windows[is_partly_valid] *= self._cut(valid, origins[is_partly_valid])
         return is_strong, windows
 
 
