@@ -1,6 +1,6 @@
 """Candidates that are fitted to windows, where descriptors do not suffice.
 
-* Blurred, noisy or saturated images: the homography is fitted to windows, and each half verifies a fit to the other.
+* Blurred, noisy or saturated images: the homography is fitted to windows.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
   band. If nearly all of these agree with a trusted seed, they predict the mapping.
 * Images without common structure in one part: no residual contains the relief there, which a homography lacks.
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, without_descriptors
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.window_fit import cross_fitted, fit_in_rounds, held_out_of_overlapping
+from agalign.fit.held_out import chessboard, one_by_one
+from agalign.fit.window_fit import cross_fitted
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
@@ -47,7 +48,8 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     def measured(mapping: PixelMapping) -> Residual:
         return start.residual if mapping is start.mapping else WarpedPair.of(pair, mapping, start.windows).residual
 
-    fitted = cross_fitted(start.mapping, measured, pair.fixed.size_px, max_moved_px)
+    size_px, side_px = pair.fixed.size_px, start.windows.side
+    fitted = cross_fitted(start.mapping, measured, size_px, chessboard, side_px, max_moved_px=max_moved_px)
     if fitted is None:
         return None
     mapping, fit = fitted.mapping, fitted.fit
@@ -67,25 +69,23 @@ def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
         return None
     start = pair.mapping(band.seed.fixed_to_moving)
     windows = pair.reference.overlapping_windows
-    fitted = fit_in_rounds(
+    fitted = cross_fitted(
         replace(start, field=None),
         lambda mapping: WarpedPair.of(pair, mapping, windows).residual,
         pair.fixed.size_px,
-        lambda fit: _are_consistent(fit.residuals_px),
-        pair.lens_std_px,
+        one_by_one,
+        windows.side,
+        is_accepted=lambda fit: _are_consistent(fit.residuals_px),
+        lens_std_px=pair.lens_std_px,
         max_moved_px=min(_MAX_MOVED_PX, pair.max_shift_px),
     )
-    if fitted is None:
+    if fitted is None or not _are_consistent(fitted.held_out.lengths_px):
         return None
-    mapping, fit = fitted
+    mapping, held_out = fitted.mapping, fitted.held_out
     warped = WarpedPair.of(pair, mapping, windows)
     if warped.alias_peak.ratio > MAX_ALIAS_PEAK:
         return None
-    size_px = pair.fixed.size_px
-    held_out = held_out_of_overlapping(warped.residual, mapping, windows.side, size_px, pair.lens_std_px)
-    if not _are_consistent(held_out.lengths_px):
-        return None
-    error = mapping_error(pair, mapping, fit.covariance_px2, held_out, mapping.field)
+    error = mapping_error(pair, mapping, fitted.fit.covariance_px2, held_out, mapping.field)
     return Candidate(pair, mapping, error, held_out, band.joint, warped, given_issues=band.rejected)
 
 

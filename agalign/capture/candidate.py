@@ -1,7 +1,7 @@
 """Candidates: the mappings that a band may get, each with its error and the windows that verify it."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -32,9 +32,8 @@ class Candidate:
     mapping: PixelMapping
     error: MappingError
     residual: Residual
-    """Windows without their own part in the fit: of a homography, each under that by the other half, to which
-    descriptors and rig contribute; of a displacement field, each under one without the windows near it. Lens shapes are
-    fitted to them: such a candidate only predicts.
+    """Windows without their own part in the fit, by the rule of `fit.held_out`; descriptors and rig contribute to each
+    fit of a homography. Lens shapes are fitted to them: such a candidate only predicts.
     """
     joint: JointResult | None = None
     """Evidence of descriptors or windows; None for a prediction by the rig."""
@@ -163,9 +162,9 @@ class RefinedBand:
     joint: JointResult
     """Without evidence of descriptors, at the seed, if the optimisation has no result."""
     warped: WarpedPair
-    by_halves: tuple[Matrix, Matrix] | None = None
-    """The homographies with the black and with the white windows of a chessboard alone, beside the descriptors and the
-    rig; None before the MAP estimation.
+    by_fold: Sequence[Matrix] = ()
+    """The homographies without each fold of the windows, by the others, descriptors and rig; empty before the MAP
+    estimation.
     """
 
     @classmethod
@@ -181,9 +180,9 @@ class RefinedBand:
 
     @property
     def verified(self) -> WarpedPair:
-        """The images under the result, with the residual of each half of its windows under that by the other half."""
+        """The images under the result, with the residual of each window under that without its fold."""
         warped = self.warped.with_mapping(self.pair.mapping(self.joint.fixed_to_moving))
-        return warped if self.by_halves is None else warped.cross_validated(self.by_halves)
+        return warped.cross_validated(self.by_fold) if self.by_fold else warped
 
     def candidates(self, use: ReliefUse) -> Iterator[Candidate]:
         """Yield the homography, then the same with a displacement field if that passes too.
@@ -212,7 +211,7 @@ class RefinedBand:
             if pair.mapping(given).is_curved:
                 continue  # with lens distortion the files are not aligned
             if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
-                return replace(self, joint=replace(joint, fixed_to_moving=given), by_halves=None)
+                return replace(self, joint=replace(joint, fixed_to_moving=given), by_fold=())
         return self
 
     def relief_fit_residual(self, mapping: PixelMapping) -> Residual:

@@ -14,6 +14,7 @@ import numpy as np
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate, mapping_error
 from agalign.errors import UnreadableFileError
+from agalign.fit.held_out import chessboard
 from agalign.fit.window_fit import cross_fitted
 from agalign.fit.windows import FixedWindows
 from agalign.pixels.band_resampling import resample_tile
@@ -66,7 +67,14 @@ def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue |
         chosen = [(tile, _windows(source, reference, tile)) for tile in _tiles(residual, reference.size_px)]
     max_moved_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
     try:
-        fitted = cross_fitted(mapping, lambda at: _residual(pair.bands[0], at, chosen), reference.size_px, max_moved_px)
+        fitted = cross_fitted(
+            mapping,
+            lambda at: _residual(pair.bands[0], at, chosen),
+            reference.size_px,
+            chessboard,
+            min((windows.side for _, windows in chosen), default=_TILE_PX),
+            max_moved_px=max_moved_px,
+        )
     except UnreadableFileError as unreadable:
         return Issue(UNREADABLE, detail=str(unreadable))
     if fitted is None or start.joint is None or fitted.held_out.median_px >= fitted.at_start.median_px:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_rig import RigPrediction, observation, rig_prediction
 from agalign.capture.candidate import RefinedBand
+from agalign.fit.held_out import chessboard, remaining
 from agalign.fit.window_fit import WindowFit, fit_windows
 from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
@@ -32,23 +33,25 @@ from agalign.values.residual import Residual
 def with_map_estimates(
     bands: Sequence[RefinedBand], rig: Rig | None, capture: Capture | None = None
 ) -> list[RefinedBand]:
-    """Return the bands of a `capture` with the MAP estimates of all windows, and with those of each half of them.
+    """Return the bands of a `capture` with the MAP estimates of all windows, and with those without each fold of them.
 
-    The windows of a band are ignored, also in its halves, if all together are too few or their correction is too large.
-    Bands without a covariance have their result.
+    The windows of a band are ignored, also without a fold, if all together are too few or their correction is too
+    large. Bands without a covariance have their result.
     """
     max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
     residuals = [band.warped.residual for band in bands]
-    halves = ([r.chessboard_half(even=even) for r in residuals] for even in (True, False))
-    fits, *of_halves = ([_fit(b, r) for b, r in zip(bands, some, strict=True)] for some in (residuals, *halves))
+    sides_px = [band.warped.windows.side for band in bands]
+    parts = (remaining(r, chessboard(r), side_px) for r, side_px in zip(residuals, sides_px, strict=True))
+    without_fold = zip(*parts, strict=True)
+    fits, *by_fold = ([_fit(b, r) for b, r in zip(bands, some, strict=True)] for some in (residuals, *without_fold))
     is_used = [fit is not None and fit.max_px <= max_correction_px for fit in fits]
-    estimates, black, white = (
+    estimates, *without = (
         _estimates(bands, [fit if used else None for fit, used in zip(some, is_used, strict=True)], rig, capture)
-        for some in (fits, *of_halves)
+        for some in (fits, *by_fold)
     )
     return [
-        replace(band, joint=joint, by_halves=(one.fixed_to_moving, other.fixed_to_moving))
-        for band, joint, one, other in zip(bands, estimates, black, white, strict=True)
+        replace(band, joint=joint, by_fold=[one.fixed_to_moving for one in others])
+        for band, joint, *others in zip(bands, estimates, *without, strict=True)
     ]
 
 

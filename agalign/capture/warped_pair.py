@@ -1,12 +1,13 @@
 """A band pair on one grid: the moving image under a mapping, and the residual of its windows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.fit.window_fit import held_out_residual
+from agalign.fit.held_out import chessboard, held_out
 from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
@@ -75,13 +76,12 @@ class WarpedPair:
         own, others = (r.median_px / max(r.coverage, 1e-6) for r in (self.residual, compared.residual))
         return own < others
 
-    def cross_validated(self, by_halves: tuple[Matrix, Matrix]) -> "WarpedPair":
-        """Return the pair with the residual of each window under a mapping that was estimated without it.
-
-        `by_halves` are homographies estimated from the black and from the white windows of a chessboard.
+    def cross_validated(self, by_fold: Sequence[Matrix]) -> "WarpedPair":
+        """Return the pair with the residual of each window under the homography that was estimated without its fold of
+        a chessboard.
         """
-        halves = (replace(self.mapping, fixed_to_moving=matrix) for matrix in by_halves)
-        return replace(self, residual=held_out_residual(self.residual, self.mapping, *halves))
+        mappings = [replace(self.mapping, fixed_to_moving=matrix) for matrix in by_fold]
+        return replace(self, residual=held_out(self.residual, self.mapping, chessboard(self.residual), mappings))
 
     @cached_property
     def alias_peak(self) -> AliasPeak:

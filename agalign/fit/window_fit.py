@@ -20,7 +20,6 @@ is known, positive parallax is nearer to the camera.
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -30,7 +29,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
-from agalign.fit.windows import Shifts, peak_weights, residual_under
+from agalign.fit.held_out import Folds, held_out, remaining
+from agalign.fit.windows import Shifts, peak_weights
 from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
@@ -209,19 +209,24 @@ class CrossFit(NamedTuple):
     at_start: Residual
     """The windows under the first mapping."""
     held_out: Residual
-    """Each window under the mapping that is fitted to the windows of the other colour of a chessboard."""
+    """Each window under the mapping that is fitted without its fold."""
 
 
 def cross_fitted(
     mapping: PixelMapping,
     measure: Callable[[PixelMapping], Residual],
     size_px: tuple[int, int],
+    folds_of: Callable[[Residual], Folds],
+    side_px: float,
+    *,
+    is_accepted: Callable[[WindowFit], bool] = lambda _: True,
+    lens_std_px: Array | None = None,
     max_moved_px: float = math.inf,
 ) -> CrossFit | None:
-    """Correct a homography by `fit_in_rounds`, and the last measurement again by half of its windows at a time.
+    """Correct a mapping by `fit_in_rounds`, and by the last measurement again without each fold of its windows.
 
-    None if all windows, or those of one colour, do not determine it, or if it moves a corner by more than
-    `max_moved_px`.
+    `side_px` is the side of the windows, px of the reference; the other arguments are those of `fit_in_rounds`. None if
+    that returns None, or if the windows without a fold do not determine the mapping.
     """
     measured: list[tuple[PixelMapping, Residual]] = []
 
@@ -229,50 +234,22 @@ def cross_fitted(
         measured.append((at, measure(at)))
         return measured[-1][1]
 
-    fitted = fit_in_rounds(mapping, measured_at, size_px, max_moved_px=max_moved_px)
+    fitted = fit_in_rounds(mapping, measured_at, size_px, is_accepted, lens_std_px, max_moved_px=max_moved_px)
     if fitted is None:
         return None
     last, residual = measured[-1]
-    halves = [fit_windows(last, residual.chessboard_half(even=even), size_px) for even in (True, False)]
+    folds = folds_of(residual)
+    fits = [fit_windows(last, part, size_px, lens_std_px) for part in remaining(residual, folds, side_px)]
     try:
-        by_black, by_white = (half.applied_to(last) for half in halves if half is not None)
-    except (GeometryError, ValueError):  # a degenerate half, or too few windows in it
+        by_fold = [fit.applied_to(last) for fit in fits if fit is not None]
+    except GeometryError:  # the windows are degenerate without a fold
         return None
-    return CrossFit(*fitted, measured[0][1], held_out_residual(residual, last, by_black, by_white))
+    if len(by_fold) < len(fits):
+        return None
+    return CrossFit(*fitted, measured[0][1], held_out(residual, last, folds, by_fold))
 
 
 # ---- all bands of a capture
-
-
-def held_out_residual(
-    residual: Residual, mapping: PixelMapping, by_black: PixelMapping, by_white: PixelMapping
-) -> Residual:
-    """Return the residual, measured with `mapping`, with the shift of each window under the mapping that was estimated
-    without it: from the black or the white windows of a chessboard.
-    """
-    black_px, white_px = (residual_under(residual, mapping, by).shifts_px for by in (by_black, by_white))
-    return residual.with_shifts(np.where(residual.is_even_cell[:, None], white_px, black_px))
-
-
-def held_out_of_overlapping(
-    residual: Residual, mapping: PixelMapping, side_px: int, size_px: tuple[int, int], lens_std_px: Array | None
-) -> Residual:
-    """Return the residual of overlapping windows, measured with `mapping`, with the shift of each window under one that
-    is fitted, with lens shapes, to the windows without common pixels; NaN if these determine none.
-
-    `side_px` is that of the windows; the other arguments are those of `fit_windows`.
-    """
-    plane = replace(mapping, field=None)
-    of_plane, result = residual_under(residual, mapping, plane), np.full_like(residual.shifts_px, np.nan)
-    for window in np.flatnonzero(residual.is_measured):
-        distances_px = np.abs(residual.centres_px - residual.centres_px[window]).max(axis=1)
-        fit = fit_windows(plane, of_plane.where(distances_px >= side_px), size_px, lens_std_px)
-        if fit is None:
-            continue
-        with suppress(GeometryError):
-            one = of_plane.where(np.arange(len(result)) == window)
-            result[window] = residual_under(one, plane, fit.applied_to(plane)).shifts_px[0]
-    return residual.with_shifts(result)
 
 
 @dataclass(frozen=True)

@@ -129,15 +129,6 @@ class Residual:
         rms_px = max(quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
         return math.sqrt(max(rms_px**2 - quantile(noise, 0.5) ** 2, (rms_px / 2) ** 2))
 
-    @property
-    def is_even_cell(self) -> NDArray[np.bool_]:
-        """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
-        return np.asarray(self.cells.sum(axis=1) % 2 == 0)
-
-    def chessboard_half(self, *, even: bool) -> "Residual":
-        """Return the black or the white windows: one half for a fit, the other for its verification."""
-        return self.where(self.is_even_cell == even)
-
     def where(self, selected: NDArray[np.bool_]) -> "Residual":
         """Return the windows where a mask (n,) is True."""
         shifts_px, peaks_sigma, cells = self.shifts_px[selected], self.peaks_sigma[selected], self.cells[selected]

@@ -1,6 +1,7 @@
 """Results by windows: where descriptors fail, where half of the image has no windows, and of coarse bands."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -293,9 +294,13 @@ def test_a_coarse_band_whose_windows_agree_in_the_fit_only_is_not_predicted(
     scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
-    monkeypatch.setattr(
-        module, "held_out_of_overlapping", lambda residual, *_: residual.with_shifts(residual.shifts_px + 9)
-    )
+    cross_fitted = module.cross_fitted
+
+    def contradicting(*arguments: Any, **named: Any) -> Any:
+        found = cross_fitted(*arguments, **named)
+        return found._replace(held_out=found.held_out.with_shifts(found.held_out.shifts_px + 9))
+
+    monkeypatch.setattr(module, "cross_fitted", contradicting)
     assert module.in_windows_that_agree(BandCandidates(band.pair, band.seed, band.issue)) is None
 
 

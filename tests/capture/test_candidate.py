@@ -1,5 +1,6 @@
 """Candidates by descriptors: a homography, and a displacement field where windows require and confirm it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import BandCandidates, RefinedBand, mapping_error
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
+from agalign.fit.held_out import chessboard
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.joint import Results
@@ -38,14 +40,10 @@ def pair() -> BandPair:
 
 
 def aligned(
-    pair: BandPair,
-    joint: JointResult,
-    use: ReliefUse,
-    seed: Seed = SEED,
-    by_halves: tuple[Matrix, Matrix] | None = None,
+    pair: BandPair, joint: JointResult, use: ReliefUse, seed: Seed = SEED, by_fold: Sequence[Matrix] = ()
 ) -> Alignment:
     """The alignment of a band by the result of the joint optimisation."""
-    return decided(pair, seed, replace(RefinedBand.of(pair, seed, joint), by_halves=by_halves).candidates(use))
+    return decided(pair, seed, replace(RefinedBand.of(pair, seed, joint), by_fold=by_fold).candidates(use))
 
 
 def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,10 +79,10 @@ def test_the_lens_field_of_the_rig_does_not_continue_by_chance(pair: BandPair) -
 def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:
     warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
     by_black, by_white = geometry.translation(6.1, -4), geometry.translation(6, -4.2)
-    crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
-    expected_px = np.where(before.is_even_cell[:, None], (0, 0.2), (-0.1, 0))
+    crossed, before = warped_pair.cross_validated((by_white, by_black)).residual, warped_pair.residual
+    expected_px = np.where(chessboard(before).numbers[:, None] == 0, (0, 0.2), (-0.1, 0))
     np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
-    assert aligned(pair, GOOD, "never", by_halves=(by_black, by_white)).residual.median_px > 0.08
+    assert aligned(pair, GOOD, "never", by_fold=(by_white, by_black)).residual.median_px > 0.08
 
 
 @pytest.mark.parametrize("kind", ["noise", "structure"])

@@ -24,6 +24,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
 from agalign.fit import window_fit
+from agalign.fit.held_out import chessboard
 from agalign.flight.rig import distance_px
 from agalign.pixels.raster import open_raster
 from agalign.values import geometry
@@ -117,7 +118,8 @@ def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
     apart = np.abs(residual.centres_px[:, None] - residual.centres_px).sum(axis=2)
     first, second = np.nonzero((apart > 0) & (apart < 1.5 * residual.spacing_px))  # neighbours in a row or a column
     assert len(first) > 40
-    assert (residual.is_even_cell[first] != residual.is_even_cell[second]).all()
+    colours = chessboard(residual).numbers
+    assert (colours[first] != colours[second]).all()
 
 
 def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture, pair: BandPair) -> None:
@@ -168,11 +170,8 @@ def test_each_window_is_verified_by_a_fit_that_shares_no_pixel_with_it(
     residual = in_files(refined(capture, on_reduced_images(pair))).residual
     assert len(residual.centres_px) > 100
     assert len(np.unique(residual.cells, axis=0)) == len(residual.cells)  # windows of several tiles have own cells
-    black, white = fitted[-2:]
-    for verified, of_fit in (
-        (residual.chessboard_half(even=True), white),
-        (residual.chessboard_half(even=False), black),
-    ):
+    for fold, of_fit in enumerate(fitted[-2:]):
+        verified = residual.where(chessboard(residual).numbers == fold)
         apart = np.abs(verified.centres_px[:, None] - of_fit.centres_px[None]).max(axis=-1)
         assert apart.min() >= 50  # the side of the windows: five in each of four tiles
 

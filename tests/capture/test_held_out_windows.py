@@ -9,6 +9,7 @@ import pytest
 
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.reference import Reference
+from agalign.fit.held_out import chessboard
 from agalign.fit.windows import FixedWindows, Shifts
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
@@ -62,7 +63,7 @@ def test_a_window_that_verifies_an_alignment_by_windows_takes_no_part_in_what_it
         return result
 
     before, off_px = aligned(moving), 0.3
-    black = before.residual.is_even_cell
+    black = chessboard(before.residual).numbers == 0
     after = aligned(moved_inside(moving, before.map(before.residual.centres_px[black]), BLURRED_PX, off_px))
     change_px = (after.residual.shifts_px - before.residual.shifts_px)[:, 0]
     assert np.median(change_px[black]) == pytest.approx(off_px, abs=0.06)
@@ -77,19 +78,19 @@ def test_the_map_estimate_without_a_colour_ignores_its_windows(border_px: int) -
     of_colour = [(cells[cells.sum(axis=1) % 2 == colour] + 0.5) * SHARP_PX - 0.5 for colour in (0, 1)]
     result = joint_result(np.eye(3), covariance=np.eye(8))
 
-    def halves(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    def by_fold(image: np.ndarray) -> tuple[np.ndarray, ...]:
         pair = pair_of(whole(fixed), with_border(image, border_px))
         estimation = estimation_of(BandCandidates(pair, SEED), RefinedBand.of(pair, SEED, result))
-        return estimation._combined()[0].by_halves
+        return estimation._combined()[0].by_fold
 
     def change_px(one: np.ndarray, other: np.ndarray) -> float:
         return geometry.corner_error_px(one, other, *fixed.shape[::-1])
 
-    before = halves(-fixed)
+    before = by_fold(-fixed)
     for colour in (0, 1):
-        after = halves(moved_inside(-fixed, of_colour[1 - colour], SHARP_PX, 0.6))
-        assert change_px(after[colour], before[colour]) < 0.01
-        assert change_px(after[1 - colour], before[1 - colour]) > 0.1
+        after = by_fold(moved_inside(-fixed, of_colour[1 - colour], SHARP_PX, 0.6))
+        assert change_px(after[1 - colour], before[1 - colour]) < 0.01
+        assert change_px(after[colour], before[colour]) > 0.1
 
 
 @pytest.mark.parametrize("border_px", BORDERS_PX)

@@ -13,6 +13,7 @@ from agalign.capture.by_rig import observation
 from agalign.capture.candidate import RefinedBand
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.warped_pair import WarpedPair
+from agalign.fit.held_out import chessboard
 from agalign.flight.rig import Observation, Rig
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
@@ -146,13 +147,13 @@ def test_the_error_of_a_prediction_is_in_px_of_the_reference(magnification: floa
 
 
 @pytest.mark.parametrize(("shift_px", "is_used"), [(0.6, True), (1.4, False)])
-def test_windows_are_ignored_in_both_halves_or_in_none(shift_px: float, is_used: bool) -> None:
-    """The correction by one half may be within the limit of 1 px where that by all windows is not."""
-    at = np.stack(np.meshgrid(np.arange(30.0, 640.0, 60.0), np.arange(30.0, 480.0, 60.0)), -1).reshape(-1, 2)
+def test_windows_are_ignored_without_each_fold_or_never(shift_px: float, is_used: bool) -> None:
+    """The correction by one fold may be within the limit of 1 px where that by all windows is not."""
+    at = np.stack(np.meshgrid(np.arange(56.0, 640.0, 112.0), np.arange(56.0, 480.0, 112.0)), -1).reshape(-1, 2)
     windows = residual_of(at, (shift_px, 0.0))
-    own_px = np.where(windows.is_even_cell, shift_px + 0.5, shift_px - 0.5)  # 0.9 px of the second half
+    own_px = np.where(chessboard(windows).numbers == 0, shift_px + 0.5, shift_px - 0.5)  # 0.9 px of the second fold
     windows = windows.with_shifts(np.column_stack([own_px, np.zeros(len(at))]))
     before = result(0, 2.0)
     (after,) = with_map_estimates([band(pairs()[0], before, windows)], None)
-    used = [abs(matrix[0, 2] - MEAN[0, 2]) > 0.05 for matrix in (after.joint.fixed_to_moving, *after.by_halves)]
+    used = [abs(matrix[0, 2] - MEAN[0, 2]) > 0.05 for matrix in (after.joint.fixed_to_moving, *after.by_fold)]
     assert used == [is_used] * 3

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from agalign.fit import displacement_field
 from agalign.fit.displacement_field import DisplacementEstimator, _Gain, common_field, fitted_field
+from agalign.fit.held_out import every_nth, held_out, one_by_one
 from agalign.fit.windows import Shifts
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
@@ -53,11 +56,13 @@ def test_the_p95_before_and_after_a_field_are_over_the_same_windows(monkeypatch:
     estimator = DisplacementEstimator(fixed.valid, structure_field(fixed))
     assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px > 0.9
 
-    def far_from_bump(_shifts: Shifts, windows: Residual, _distance_px: float) -> np.ndarray:
-        near = np.linalg.norm(windows.centres_px - (300, 220), axis=1, keepdims=True) < 200
-        return np.where(near, np.nan, np.zeros(2))
+    zero = DisplacementField(24.0, np.zeros((21, 28, 2)))
 
-    monkeypatch.setattr(estimator, "_cross_predicted", far_from_bump)
+    def far_from_bump(held_out_px: np.ndarray, _shifts: Shifts) -> DisplacementField | None:
+        return None if (np.linalg.norm(held_out_px - (300, 220), axis=1) < 200).any() else zero
+
+    monkeypatch.setattr(estimator, "_field_apart_from", far_from_bump)
+    monkeypatch.setattr(displacement_field, "every_nth", lambda residual, _: one_by_one(residual))
     assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px < 0.3
 
 
@@ -101,11 +106,7 @@ def test_smoothness_is_relative_to_the_number_of_captures(monkeypatch: pytest.Mo
 
 def test_a_field_without_held_out_windows_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """A single textured patch has windows to fit, and none at a distance from them."""
-
-    def nowhere(*arguments: object) -> np.ndarray:
-        return np.full((len(arguments[2].centres_px), 2), np.nan)
-
-    monkeypatch.setattr(DisplacementEstimator, "_cross_predicted", nowhere)
+    monkeypatch.setattr(DisplacementEstimator, "_field_apart_from", lambda *_: None)
     image = texture(*SIZE)
     result = DisplacementEstimator(image.valid, structure_field(image)).refine(image, PixelMapping(np.eye(3)))
     assert (result.field, result.after_p95_px) == (None, np.inf)
@@ -132,8 +133,10 @@ def test_a_field_fitted_to_noise_does_not_predict_held_out_windows(chance: int) 
     field = fitted_field(measured, 0.001, 24, SIZE)
     explained, given = (np.linalg.norm(v, axis=1) for v in (shifts - field(CENTRES), shifts))
     assert np.median(explained) < 0.8 * np.median(given)
-    predicted = np.linalg.norm(shifts - estimator._cross_predicted(measured, residual, 40), axis=1)
-    assert np.nanmedian(predicted) > 0.95 * np.median(given)
+    folds, start = every_nth(residual, 4), PixelMapping(np.eye(3))
+    of_folds = (CENTRES[folds.numbers == fold] for fold in range(folds.count))
+    by_fold = [replace(start, field=estimator._field_apart_from(of_fold, measured)) for of_fold in of_folds]
+    assert held_out(residual, start, folds, by_fold).median_px > 0.95 * np.median(given)
 
 
 def test_a_field_has_the_prior_of_its_weights(monkeypatch: pytest.MonkeyPatch) -> None:
