@@ -1,7 +1,7 @@
 """Residual shifts of windows between the structures of two bands on one grid."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 import cv2
@@ -73,11 +73,12 @@ class FixedWindows:
         # From the complete grid: windows that drop out later must not change the column and row of the others.
         cells = np.stack([np.unique(along, return_inverse=True)[1] for along in origins.T], axis=1)
         inside = (origins + self.side <= (width, height)).all(axis=1)
-        origins, cells = origins[inside], cells[inside]
-        is_strong, windows = self._strong(structure, self.valid, origins, self._valid_counts(self.valid, origins))
-        self.origins, self.cells = origins[is_strong], cells[is_strong]
+        self.origins = origins[inside]
+        counts, every = self._valid_counts(self.valid), np.arange(len(self.origins))
+        rows, spectra = zip(*self._spectra(structure, self.valid, every, counts), strict=True)
+        strong = np.concatenate(rows)
+        self.origins, self.cells, self.spectra = self.origins[strong], cells[inside][strong], np.concatenate(spectra)
         self.centres_px = self.origins + (self.side - 1) / 2
-        self.spectra = windowed_spectra(windows)
 
     @classmethod
     def on_chessboard(
@@ -102,16 +103,10 @@ class FixedWindows:
         and with it the weight of the shift. Windows with too few are omitted.
         """
         mask, structure = _inside(moving.valid), structure_field(moving)
-        counts = self._valid_counts(mask, self.origins)
-        share = self._valid_counts(self.valid & mask, self.origins) / self.side**2
-        with_pixels = np.flatnonzero(share >= self.min_valid)
-        at_once = 64  # windows that fit into the CPU's cache: a quarter faster
-        parts = [(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))]
-        for first in range(0, len(with_pixels), at_once):
-            rows = with_pixels[first : first + at_once]
-            is_strong, windows = self._strong(structure, mask, self.origins[rows], counts[rows])
-            rows = rows[is_strong]
-            cross = whitened_cross_spectra(self.spectra[rows], windowed_spectra(windows))
+        share, counts = self._valid_counts(self.valid & mask) / self.side**2, self._valid_counts(mask)
+        with_pixels, parts = np.flatnonzero(share >= self.min_valid), []
+        for rows, spectra in self._spectra(structure, mask, with_pixels, counts):
+            cross = whitened_cross_spectra(self.spectra[rows], spectra)
             masked = share[rows] < 1 - _MAX_IGNORED_SHARE
             if masked.any():
                 fixed, other = (self._cut(valid, self.origins[rows[masked]]) for valid in (self.valid, mask))
@@ -127,10 +122,23 @@ class FixedWindows:
         x, y = origins.T
         return np.asarray(sliding_window_view(image, (self.side, self.side))[y, x])
 
-    def _valid_counts(self, valid: Mask, origins: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the number (n,) of valid pixels in the windows with these origins."""
-        sums, (x, y), side = cv2.integral(valid.view(np.uint8)), origins.T, self.side
+    def _valid_counts(self, valid: Mask) -> NDArray[np.int64]:
+        """Return the number (n,) of valid pixels in the windows."""
+        sums, (x, y), side = cv2.integral(valid.view(np.uint8)), self.origins.T, self.side
         return np.asarray(sums[y + side, x + side] - sums[y, x + side] - sums[y + side, x] + sums[y, x], np.int64)
+
+    def _spectra(
+        self, field: Field, valid: Mask, rows: NDArray[np.int64], counts: NDArray[np.int64]
+    ) -> Iterator[tuple[NDArray[np.int64], Field]]:
+        """Yield the windows with structure among some windows, `rows` (m,), and their spectra, a part at a time.
+
+        `counts` (n,) are the valid pixels of all windows.
+        """
+        at_once = 64  # windows that fit into the CPU's cache: a quarter faster
+        for first in range(0, max(len(rows), 1), at_once):
+            part = rows[first : first + at_once]
+            is_strong, windows = self._strong(field, valid, self.origins[part], counts[part])
+            yield part[is_strong], windowed_spectra(windows)
 
     def _strong(
         self, field: Field, valid: Mask, origins: NDArray[np.int64], counts: NDArray[np.int64]
