@@ -28,7 +28,7 @@ from peers import dis_flow
 from synthetic_flights.depth import BandTruth, Scene, Truth, write_capture
 from synthetic_flights.relief import FOOLING, GEOMETRIES, fooling, make_scene
 
-from agalign import SidecarError, read_alignment
+from agalign import Alignment, SidecarError, read_alignment
 from agalign.values.image import Tile
 
 DEFAULT, START, FLOW = "agalign", "agalign, homography alone", "DIS flow on structure"
@@ -63,6 +63,10 @@ class Score:
     p90_px: float = _column("p90, px", ".2f")
     beyond_1_px: float = _column("beyond 1 px", ".1%")
     """Share of the pixels."""
+    within_1: float = _column("within the expected error", ".0%")
+    """Share of the pixels whose error is at most the expected error of the pixel: 63 % for normal errors."""
+    within_2: float = _column("within twice", ".0%")
+    """Within twice as much: 98 %."""
     range_error: float = _column("range error", ".2%")
     """Median relative error of the relief's range."""
     density: float = _column("density", ".0%")
@@ -84,17 +88,25 @@ class Score:
         return f"{self.kind}, {'close' if self.close else 'far'}, scene {self.scene}"
 
 
-def mapping_of(sidecar: Path, band: str, size_px: tuple[int, int]) -> Map | None:
-    """Return the mapping of a band at every pixel of the reference; None where its sidecar has none."""
+def alignment_of(sidecar: Path, band: str) -> Alignment | None:
+    """Return the alignment of a band; None where its sidecar has none."""
     try:
-        return read_alignment(sidecar, band).mapping.positions(Tile(0, 0, *size_px))
+        return read_alignment(sidecar, band)
     except SidecarError:
         return None
 
 
-def residuals(mapping: Map | None, truth: BandTruth, window: tuple[slice, slice]) -> dict[str, float]:
+def mapping_of(alignment: Alignment | None) -> Map | None:
+    """Return the mapping of a band at every pixel of the reference."""
+    return None if alignment is None else alignment.mapping.positions(Tile(0, 0, *alignment.size_px))
+
+
+def residuals(
+    mapping: Map | None, truth: BandTruth, window: tuple[slice, slice], expected_px: NDArray[np.floating] | None = None
+) -> dict[str, float]:
     """Return median, 90th percentile and share beyond 1 px of the distance to the truth, as fields of a score, over
-    pixels of a window of the reference that the band shows and that did not move.
+    pixels of a window of the reference that the band shows and that did not move; with the expected errors (height,
+    width) of the mapping, also the shares within them.
     """
     some = truth.scored[window]
     if mapping is None or not some.any():
@@ -103,7 +115,11 @@ def residuals(mapping: Map | None, truth: BandTruth, window: tuple[slice, slice]
     # A pixel without a mapping is infinitely far off, which no interpolating quantile can express.
     error_px = np.where(np.isfinite(error_px), error_px, np.inf)
     median, p90 = np.percentile(error_px, (50, 90), method="lower").tolist()
-    return {"median_px": median, "p90_px": p90, "beyond_1_px": float((error_px > 1).mean())}
+    result = {"median_px": median, "p90_px": p90, "beyond_1_px": float((error_px > 1).mean())}
+    if expected_px is not None:
+        ratio = error_px / expected_px[window][some]
+        result |= {"within_1": float((ratio <= 1).mean()), "within_2": float((ratio <= 2).mean())}
+    return result
 
 
 def range_errors(range_m: NDArray[np.float64] | None, expected_m: NDArray[np.floating]) -> dict[str, float]:
@@ -142,7 +158,9 @@ def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
     of_range = range_errors(layer(path.with_suffix(".relief.tif"), "range"), truth.range_m[window])
     for band in (b for b in sidecar.bands if b.status != "reference"):
         known = truth.bands[band.band]
-        values = residuals(mapping_of(path, band.band, sidecar.reference.size_px), known, window)
+        alignment = alignment_of(path, band.band)
+        expected_px = None if alignment is None else alignment.error_map_px
+        values = residuals(mapping_of(alignment), known, window, expected_px)
         written = None if band.place is None else layer(path.with_suffix(".tif"), band.band)
         values |= occlusion_scores(written, known, window)
         yield replace(blank, band=band.band, status=band.status, **values, **of_range)
@@ -154,7 +172,7 @@ def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Sco
     (path, sidecar), scores, total_s = common.only_sidecar(out), [], 0.0
     reference = images[Path(sidecar.reference.file).name]
     for band in (b for b in sidecar.bands if b.status != "reference"):
-        start = mapping_of(path, band.band, sidecar.reference.size_px)
+        start = mapping_of(alignment_of(path, band.band))
         moving = images[Path(band.file).name]
         seconds, mapping = (0.0, None) if start is None else common.timed(dis_flow, reference, moving, start)
         total_s += seconds
@@ -208,6 +226,8 @@ def table_rows(scores: Sequence[Score]) -> Iterator[TableRow]:
         "median error, px": ("median_px", ".3f"),
         "p90, px": ("p90_px", ".2f"),
         "beyond 1 px, %": ("beyond_1_px", ".1%"),
+        "within the expected error, %": ("within_1", ".0%"),
+        "within twice, %": ("within_2", ".0%"),
         "error of the range, %": ("range_error", ".2%"),
     }
     for name, some in ((name, some) for name, some in groups.items() if some):

@@ -28,6 +28,9 @@ def test_residuals_are_of_what_is_visible_and_still() -> None:
     mapping = truth.moving_px + np.where(left | top, 100.0, 0.25)[..., None] * (0.6, 0.8)
     expected = {"median_px": 0.25, "p90_px": 0.25, "beyond_1_px": 0.0}
     assert residuals(mapping, truth, WHOLE) == pytest.approx(expected, abs=1e-4)
+    claimed_px = np.where(HERE[..., 0] < 60, 0.1, 0.2)  # 12 of 48 columns are more than twice as far off
+    shares = residuals(mapping, truth, WHOLE, claimed_px)
+    assert (shares["within_1"], shares["within_2"]) == (0.0, 0.75)
     written = np.s_[4:60, 50:90]
     partly = np.full_like(mapping, np.nan)
     partly[written] = (truth.moving_px + np.where(HERE[..., 0] < 60, 2.0, 0.25)[..., None] * (0.6, 0.8))[written]
