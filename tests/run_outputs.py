@@ -98,3 +98,9 @@ def capture_by(camera: str, shared: Shared) -> Path:
         make_two_headings(folder, 1, (480, 360), camera=CAMERAS[camera], line=1, lakes=False)
 
     return shared(f"capture by {camera}", fill)
+
+
+def facts_of(folder: Path) -> dict[str, Any]:
+    """The data in the report of a run."""
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    return json.loads(page.partition('<script type="application/json" id="facts">')[2].partition("</script>")[0])

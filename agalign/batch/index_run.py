@@ -13,7 +13,7 @@ from agalign.batch.workers import failure_text, numbers_of_workers, open_workers
 from agalign.errors import AgalignError, ConfigurationError, SidecarError
 from agalign.host.files import REPORT_FILE, written_below
 from agalign.host.own_files import refuse_foreign_pages
-from agalign.host.processes import usable_cores
+from agalign.host.processes import cores_for
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
@@ -101,7 +101,7 @@ def run_indices(
     and OutputError if the table or the pages cannot be written.
     """
     # Starting a process takes as long as the indices of eight captures.
-    processes, _ = numbers_of_workers(len(tasks), jobs or usable_cores(), worth_a_process=8)
+    processes, _ = numbers_of_workers(len(tasks), cores_for(jobs), worth_a_process=8)
     rows: list[IndexReport] = []
     try:
         with open_workers(executor, processes, cv2.setNumThreads, preload=__name__) as run_tasks:

@@ -32,7 +32,7 @@ from agalign.flight.sky import SkyCapture
 from agalign.host.files import MODELS_FOLDER, check_inside, path_problem, written_below
 from agalign.host.output_folder import is_full, locked
 from agalign.host.own_files import refuse_foreign
-from agalign.host.processes import usable_cores
+from agalign.host.processes import cores_for
 from agalign.host.text import counted, name_problem
 from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
@@ -316,7 +316,7 @@ class _FlightRun:
         """
         plan, timeout_s = self._plan(captures), self.options.timeout_s
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
-        cores = self.options.jobs or (usable_cores() if on_cpu else 1)
+        cores = cores_for(self.options.jobs or (0 if on_cpu else 1))  # a GPU serves one process
         has_timeout = timeout_s is not None
         numbers = partial(numbers_of_workers, cores=cores, has_timeout=has_timeout)
 

@@ -26,6 +26,7 @@ from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError, open_pool
 from agalign.host.processes import (
     WORKER_MODULE,
+    cores_for,
     environment_of_children,
     usable_cores,
     without_interrupt_key,
@@ -277,7 +278,7 @@ def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
                 stack.enter_context(environment_of_children(threads=1))
                 with without_interrupt_key():  # of a terminal, for all its processes: the workers end with the cluster
                     cluster = LocalCluster(
-                        n_workers=jobs or usable_cores(),
+                        n_workers=cores_for(jobs),
                         threads_per_worker=1,
                         processes=True,
                         dashboard_address=None,

@@ -12,7 +12,7 @@ from agalign.batch.preload import preload_libraries
 from agalign.cli.command import Command, Given
 from agalign.cli.config_file import load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
-from agalign.host.processes import usable_cores
+from agalign.host.processes import cores_for
 from agalign.host.text import counted
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 
@@ -53,7 +53,7 @@ def _align(
     settings = Settings.model_validate(given["settings"])
     dask = given["run"].pop("executor")
     options = RunOptions(**given["run"], command=command_line())
-    cores = options.jobs or usable_cores()
+    cores = cores_for(options.jobs)
     requested = chosen_indices(settings.write.indices)
     load_ahead()
     from agalign.batch.workers import start_server_ahead

@@ -30,6 +30,11 @@ def usable_cores() -> int:
     return cores if quota is None else max(1, min(cores, math.ceil(quota)))
 
 
+def cores_for(jobs: int) -> int:
+    """Return the number of cores of so many jobs; 0 jobs are one per core."""
+    return jobs or usable_cores()
+
+
 def limit_default_threads() -> None:
     """Limit the threads of libraries that are imported later to the quota of the control group, which they do not read.
 

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
@@ -51,8 +51,7 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     """
     refuse_foreign_pages(out)
     unreadable: list[str] = []
-    facts, flight_map = FlightFacts(out), FlightMap()
-    rows = _add_captures(out, facts, flight_map, unreadable.append)
+    facts, flight_map, rows = _captures(out, unreadable.append)
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -91,12 +90,18 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     return facts
 
 
-def _add_captures(
-    out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], object]
-) -> list[IndexReport]:
-    """Add all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows."""
+def _captures(
+    out: Path, on_problem: Callable[[str], object], table: Sequence[IndexReport] | None = None
+) -> tuple[FlightFacts, FlightMap, list[IndexReport]]:
+    """Return the data of all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows too.
+
+    All captures have to be read before it is known that the table leaves out rasters that are not masked like most:
+    if it does, they are read again, with the rows of the `table`.
+    """
+    facts, flight_map, shown = FlightFacts(out), FlightMap(), set[Path]()
     # An index that could not be calculated has no raster, whose removal would remove the row.
-    earlier = [row for row in current_rows(out) if row.path is not None or (out / f"{row.capture}.json").is_file()]
+    earlier = current_rows(out) if table is None else table
+    earlier = [row for row in earlier if row.path is not None or (out / f"{row.capture}.json").is_file()]
     rows_of: dict[str, list[IndexReport]] = defaultdict(list)
     for row in earlier:
         rows_of[row.capture].append(row)
@@ -111,12 +116,18 @@ def _add_captures(
             on_problem(problem)
         changed |= problems.keys()
         sidecar = _without(sidecar, path.parent, problems)
-        of_capture = reports_of(sidecar, label, out, facts.pairs.run)
+        of_capture = reports_of(sidecar, label, out, facts.pairs.run) if table is None else []
         indices += of_capture
-        rows = [row for row in rows_of.get(label, []) if row.path not in changed]
-        facts.add(label, sidecar, merged(rows, of_capture))
+        rows = merged([row for row in rows_of.get(label, []) if row.path not in changed], of_capture)
+        shown |= {row.path for row in rows if row.path is not None}
+        facts.add(label, sidecar, rows)
         flight_map.add(Path(label).parent.as_posix(), sidecar)
-    return update_table(out, indices, [row for row in earlier if row.path not in changed])
+    if table is not None:
+        return facts, flight_map, [*table]
+    written = update_table(out, indices, [row for row in earlier if row.path not in changed])
+    if shown - {row.path for row in written}:
+        return _captures(out, lambda _: None, written)
+    return facts, flight_map, written
 
 
 def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[tuple[Path, Sidecar, str]]:

@@ -22,7 +22,7 @@ from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, write_capture
 from ..program import agalign_here
 from ..rasters.test_relief_map import Run
-from ..run_outputs import table_in
+from ..run_outputs import facts_of, table_in
 
 pytestmark = pytest.mark.slow
 
@@ -389,6 +389,8 @@ def test_the_table_of_indices_has_no_unmasked_row_among_masked_ones(
     assert first["median"]
     assert (second["median"], second["file"]) == ("", "")
     assert "not masked by quality flags, unlike those of most captures" in second["problem"]
+    shown = [record["indices"] for record in facts_of(out)["details"]["records"]]
+    assert [len(of_capture) for of_capture in shown] == [1, 0]
     agalign_here(flight, "-o", out)
     assert agalign_here(*command, "--mask-qa").returncode == 0
     assert all(row["median"] and row["file"] for row in table_in(out / "indices.csv"))

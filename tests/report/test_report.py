@@ -35,7 +35,7 @@ from agalign.values.image import OutputGrid
 
 from ..conftest import read_json, save_known_model, seeded, textured_image
 from ..records.test_sidecar import ALIGNED, NIR, example
-from ..run_outputs import change, table_in
+from ..run_outputs import change, facts_of, table_in
 
 PAGE = Path(agalign.__file__).parent / "report"
 
@@ -43,12 +43,6 @@ PAGE = Path(agalign.__file__).parent / "report"
 @pytest.fixture
 def out(aligned_flight: Path, tmp_path: Path) -> Path:
     return shutil.copytree(aligned_flight, tmp_path / "out")
-
-
-def facts_of(folder: Path) -> dict[str, Any]:
-    """The data in the page."""
-    page = (folder / "index.html").read_text(encoding="utf-8")
-    return json.loads(page.partition('<script type="application/json" id="facts">')[2].partition("</script>")[0])
 
 
 def script_of(file: Path) -> dict[str, Any]:
