@@ -1,4 +1,4 @@
-"""Errors of the seeds of each camera: the table of docs/reference/cameras.md.
+"""Errors of the seeds of each camera, px: median and maximum over pairs, by kind of seed.
 
     python benchmarks/seeds.py DATA
 

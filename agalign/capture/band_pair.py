@@ -249,7 +249,7 @@ def _pair(
     is_coarse = longest < min(LONGEST_SIDE_PX, max(band.size_px))
     scales = PairScales.of((band.size_px, bands[0].size_px), (reference.image.size_px, moving.size_px))
     reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
-    tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/reference/cameras.md)
+    tags_std_px = 5.0  # their errors in flights have medians of 2 to 9 px and a maximum of 12 px (benchmarks/seeds.py)
     std_px: dict[SeedKind, float] = dict.fromkeys(_TAGS, tags_std_px * scales.fixed.x)
     layout = relative_parallax(band, bands[0])
     pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, layout=layout)

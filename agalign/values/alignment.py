@@ -109,8 +109,8 @@ class JointResult:
     levels: tuple[Number, ...]
     """Resolutions of the image pyramid; 1 is full."""
     recipe: str
-    """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
-    alone)."""
+    """`flight` (frozen network of the flight), `fast` or `scratch` (learned on this capture), `paper`, or `windows`
+    (windows alone)."""
     model_family: ModelFamily
     """Kind of mapping that was fitted to the descriptors; windows may make it a homography."""
     last_step_px: Number

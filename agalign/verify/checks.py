@@ -234,8 +234,7 @@ def repetition_issues(alias: AliasPeak, is_expected: Callable[[tuple[float, floa
 
 def seed_fits(residual: Residual) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
-    # Rig tags have errors of a few px (docs/reference/cameras.md).
-    max_median_px = 8.0
+    max_median_px = 8.0  # rig tags of flights have median errors of 2 to 9 px (benchmarks/seeds.py)
     return residual.coverage >= _MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
 
 
