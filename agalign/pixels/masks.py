@@ -113,6 +113,13 @@ def without_parts(valid: Mask, parts: Sequence[Tile], window: Tile) -> Mask:
     return result
 
 
+def saturated(valid: Mask, pixels: ArrayLike, saturation_value: float | None) -> Mask:
+    """Return (height, width) True for valid pixels that are saturated; none if the value is unknown."""
+    if saturation_value is None:
+        return np.zeros(valid.shape, dtype=bool)
+    return np.asarray(valid & (np.asarray(pixels) >= saturation_value))
+
+
 def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) -> Mask:
     """Return (height, width) True for valid pixels outside of saturated areas and their direct neighbours.
 

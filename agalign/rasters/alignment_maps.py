@@ -12,6 +12,7 @@ from agalign.cameras.pix4d import rig_unit_m
 from agalign.cameras.tag_seeds import rig_seed
 from agalign.errors import GeometryError
 from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.pixels.masks import saturated
 from agalign.rasters.geotiff import LayerDescription, compressed
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import Product, ProductContext, WrittenFile
@@ -156,26 +157,20 @@ def _of_source(layer: Layer, tile: Tile) -> dict[Quality, Mask]:
     band = layer.band
     if layer.mapping is None:
         pixels, valid = layer.read(band, tile)
-        return {Quality.NODATA: ~valid, Quality.SATURATED: _saturated(pixels, valid, band.saturation_value)}
+        return {Quality.NODATA: ~valid, Quality.SATURATED: saturated(valid, pixels, band.saturation_value)}
     positions, source = source_positions(layer.mapping, tile, layer.size_px, band.size_px)
     inside = is_inside(positions, band)
     if source is None:
         return {Quality.OUTSIDE: ~inside}
     pixels, valid = layer.read(band, source)
     in_window = (positions - (source.x0, source.y0)).astype(np.float32)
-    saturated = _saturated(pixels, valid, band.saturation_value)
+    is_saturated = saturated(valid, pixels, band.saturation_value)
     return {
         Quality.OUTSIDE: ~inside,
         Quality.NODATA: inside & _contributes(~valid, in_window),
-        Quality.SATURATED: inside & _contributes(saturated, in_window),
+        Quality.SATURATED: inside & _contributes(is_saturated, in_window),
         Quality.OCCLUDED: inside & layer.mapping.hidden(tile),
     }
-
-
-def _saturated(pixels: NDArray[np.generic], valid: Mask, saturation_value: float | None) -> Mask:
-    if saturation_value is None:
-        return np.zeros(pixels.shape, dtype=bool)
-    return np.asarray(valid & (pixels.astype(np.float64) >= saturation_value))
 
 
 def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:

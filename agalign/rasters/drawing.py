@@ -14,10 +14,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from agalign.errors import OutputError, UnreadableFileError
 from agalign.host.files import complete_file
+from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import JPEG_MARK, PNG_MARK
+from agalign.pixels.masks import saturated
 from agalign.pixels.raster import ReadTile, read_preview, read_tile, with_nan
-from agalign.values.capture import Capture
+from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid, Tile, reduced_size_px
+from agalign.values.resampling import tiles
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
@@ -38,7 +41,8 @@ class ReducedBands:
     size_px: tuple[int, int]
     """(width, height) of all images."""
     saturated: Mapping[str, float] = field(default_factory=dict)
-    """Share of saturated pixels in the raw file of each band with a known saturation value, after the reduction."""
+    """Share of saturated pixels in the part of the raw file that the grid shows, of each band with a known saturation
+    value."""
     indices_before: Mapping[str, Grey] = field(default_factory=dict)
     """Indices of the unaligned bands, by name, on the output grid, not reduced: 0 and 255 are the ends of their colour
     scale."""
@@ -55,7 +59,7 @@ def read_reduced_bands(
     the capture's files. Those of `written` are known already. Raises UnreadableFileError for the written ones.
     """
     size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / MAX_REDUCED_PX))
-    before, saturated = {}, {}
+    before, saturated_shares = {}, {}
     for band in capture.bands:
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
             to_band = np.divide(band.size_px, np.multiply(grid.scale, capture.reference.size_px))
@@ -68,13 +72,26 @@ def read_reduced_bands(
                 plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
             before[band.name] = grey(plane)
             if band.saturation_value is not None:
-                saturated[band.name] = np.count_nonzero(plane >= band.saturation_value) / plane.size
+                saturated_shares[band.name] = _saturated_share(band, window, read)
     whole_px, known = (0, 0, grid.width, grid.height), written or {}
     after = {
         name: known[name] if name in known else grey(read_preview(*place, whole_px, size_px))
         for name, place in places.items()
     }
-    return ReducedBands(before, after, size_px, saturated)
+    return ReducedBands(before, after, size_px, saturated_shares)
+
+
+def _saturated_share(band: Band, window: Tile, read: ReadTile) -> float:
+    """Return the share of saturated pixels in the part of a window that is in a file: a reduced image has means, which
+    are not saturated.
+    """
+    x0, y0 = max(window.x0, 0), max(window.y0, 0)
+    x1, y1 = min(window.x0 + window.width, band.width_px), min(window.y0 + window.height, band.height_px)
+    inside, count = Tile(x0, y0, max(x1 - x0, 0), max(y1 - y0, 0)), 0
+    for tile in tiles(inside, WORK_TILE_PX):
+        pixels, valid = read(band, tile)
+        count += int(np.count_nonzero(saturated(valid, pixels, band.saturation_value)))
+    return count / max(inside.width * inside.height, 1)
 
 
 def _is_inside(tile: Tile, size_px: tuple[int, int]) -> bool:
