@@ -295,7 +295,7 @@ def _blocks(
             else:
                 pixels, valid = _tile_of(layer, tile, context.settings.write)
                 pixels = pixels.astype(dtype, copy=False)
-                if nodata is not None and not (valid.all() and layer.is_copied):
+                if nodata is not None:
                     pixels = with_nodata(pixels, valid, nodata)
                 if pixels.shape == (grid.height, grid.width) and max(pixels.shape) <= MAX_REDUCED_PX:
                     grey_of[layer.band.name] = grey(with_nan(pixels, nodata))
@@ -360,9 +360,8 @@ def with_nodata(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
 
 
 def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any]) -> float:
-    """The first of 0, the largest value of the type, 1, 2 … that no copied band contains; 0 if there is none.
-
-    Copied pixels then keep their values.
+    """The first of 0, the largest value of the type, 1, 2 … that no copied band contains: copied pixels then keep their
+    values. 0 if there is none, as with all 256 values of 8 bits.
     """
     copied = []
     for layer in (one for one in layers if one.is_copied):

@@ -188,6 +188,17 @@ def test_nodata_is_a_value_that_copied_pixels_do_not_have(tmp_path: Path) -> Non
     assert moved[-1, -1] == 1
 
 
+def test_copied_pixels_change_where_no_value_is_left_for_nodata(tmp_path: Path) -> None:
+    """All 256 values are measurements: those of 0 become 1, as the file has gaps, which are 0."""
+    capture, every = make_capture(tmp_path, "uint8"), np.arange(150 * 200, dtype=np.int64).reshape(150, 200) % 256
+    change(capture.reference, lambda pixels: np.copyto(pixels, every.astype(np.uint8)))
+    with rasterio.open(write(capture, FRAME, [Layer(capture.bands[0], None), *layers_of(capture)[1:]])) as written:
+        gap, copied, _ = written.read()
+        assert written.nodata == 0
+    np.testing.assert_array_equal(copied, np.maximum(every, 1))
+    assert not gap.any()
+
+
 def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
     """A write that fails once while GDAL closes a file leaves a tile of zeros and no error."""
     pixels = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)
