@@ -58,13 +58,12 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
     them are not in its input; return True if it did not do all.
     """
     from agalign.errors import SidecarError
-    from agalign.records.panels_and_sky import read_panels_and_sky
+    from agalign.records.panels_and_sky import read_panels, read_sky
     from agalign.records.run_record import read_run_record, unfinished_run
 
     try:
-        panels, sky = read_panels_and_sky(out)
-        record = read_run_record(out)
-        unfinished = unfinished_run(record, (*panels, *sky), labels)
+        excluded, record = [*read_panels(out), *read_sky(out)], read_run_record(out)
+        unfinished = unfinished_run(record, excluded, labels)
     except SidecarError as error:
         terminal.problem(str(error))
         return True

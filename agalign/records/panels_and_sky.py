@@ -173,22 +173,29 @@ PANEL_AND_SKY_FILES = {PANELS_FILE: b'{\n "schema": "agalign-panels/', SKY_FILE:
 """How each of the two files starts, by name."""
 
 
-def read_panels_and_sky(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
-    """Return the captures of panels and those of the sky of an earlier run.
+def read_panels(out: Path) -> list[PanelPart]:
+    """Return the captures of panels of an earlier run. Raises SidecarError for a file that agalign did not write."""
+    file = read_model(out / PANELS_FILE, PanelsFile)
+    return [] if file is None else file.panels
 
-    Raises SidecarError for a file that agalign did not write.
-    """
-    panels, sky = read_model(out / PANELS_FILE, PanelsFile), read_model(out / SKY_FILE, SkyFile)
-    return ([] if panels is None else panels.panels), ([] if sky is None else sky.captures)
+
+def read_sky(out: Path) -> list[SkyPart]:
+    """Return the captures of the sky of an earlier run. Raises SidecarError for a file that agalign did not write."""
+    file = read_model(out / SKY_FILE, SkyFile)
+    return [] if file is None else file.captures
 
 
 def last_panels_and_sky(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
-    """Return the captures as `read_panels_and_sky`; none if a file cannot be read, which the commands that need it
-    name.
+    """Return the captures of panels and those of the sky; none of a file that cannot be read, which the commands that
+    need it name.
     """
+    panels: list[PanelPart] = []
+    sky: list[SkyPart] = []
     with suppress(SidecarError):
-        return read_panels_and_sky(out)
-    return [], []
+        panels = read_panels(out)
+    with suppress(SidecarError):
+        sky = read_sky(out)
+    return panels, sky
 
 
 def exclusions(parts: Iterable[PanelOrSkyPart]) -> list[str]:

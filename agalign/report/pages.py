@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup
@@ -23,7 +23,7 @@ from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
-from agalign.records.panels_and_sky import PanelPart, SkyPart, exclusions, read_panels_and_sky
+from agalign.records.panels_and_sky import PanelPart, SkyPart, exclusions, read_panels, read_sky
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import find_sidecars, label_of, place_problem, read_sidecar
@@ -36,6 +36,7 @@ from agalign.report.terms import PAGES, TERMS
 from agalign.spectral_indices.indices_csv import current_rows, merged, reports_of, update_table
 from agalign.spectral_indices.rasters import IndexReport
 
+T = TypeVar("T")
 _MAX_LISTED = 100
 """Entries of a list in the page; OUT/summary.csv and OUT/agalign-run.json have all."""
 _MAX_EXCLUDED = 20
@@ -52,13 +53,15 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     refuse_foreign_pages(out)
     unreadable: list[str] = []
     facts, flight_map, rows = _captures(out, unreadable.append)
-    panels: list[PanelPart] = []
-    sky: list[SkyPart] = []
-    run: RunPart | None = None
-    try:
-        (panels, sky), run = read_panels_and_sky(out), read_run_record(out)
-    except SidecarError as error:
-        unreadable.append(str(error))
+
+    def readable(read: Callable[[Path], T]) -> T | None:
+        try:
+            return read(out)
+        except SidecarError as error:
+            unreadable.append(str(error))
+            return None
+
+    panels, sky, run = readable(read_panels) or [], readable(read_sky) or [], readable(read_run_record)
     excluded: list[PanelPart | SkyPart] = [*(one for one in panels if one.is_left_out), *sky]
     for one in excluded:
         facts.add_excluded(one)

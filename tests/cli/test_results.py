@@ -13,7 +13,7 @@ from agalign.cli import align_run
 from agalign.cli.align_run import conclude
 from agalign.cli.terminal import Terminal
 from agalign.records.captures import captures_of_run
-from agalign.records.panels_and_sky import read_panels_and_sky
+from agalign.records.panels_and_sky import read_sky
 from agalign.records.run_record import read_run_record, unfinished_run
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, write_sidecar
 
@@ -253,8 +253,7 @@ def test_captures_of_panels_and_of_the_sky_need_no_result(out: Path) -> None:
     identity = {"folder": "0000SET/000", "captured_at": "", "cues": ["a"]}
     sky = [{**identity, "capture": "IMG_0002", "bands": []}]
     (out / "sky.json").write_text(json.dumps({"schema": "agalign-sky/1", "captures": sky}))
-    panels, sky = read_panels_and_sky(out)
-    unfinished = unfinished_run(read_run_record(out), (*panels, *sky), {FIRST})
+    unfinished = unfinished_run(read_run_record(out), read_sky(out), {FIRST})
     assert (unfinished.found, unfinished.missing, unfinished.sentence) == (1, [], "")
 
 

@@ -23,7 +23,7 @@ from agalign.config import albedos
 from agalign.errors import AgalignError, SidecarError
 from agalign.host.files import RUN_FILE
 from agalign.pixels.raster import probe
-from agalign.records.panels_and_sky import read_panels_and_sky
+from agalign.records.panels_and_sky import read_panels
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar_file import read_checked, read_sidecar
 from agalign.values.capture import Band
@@ -139,7 +139,7 @@ def test_any_json(tmp_path: Path, data: object, raw: bytes | None) -> None:
     for name, read, given_path in (
         ("a.json", read_sidecar, tmp_path / "a.json"),
         ("a.json", read_checked, tmp_path / "a.json"),
-        ("panels.json", read_panels_and_sky, tmp_path),
+        ("panels.json", read_panels, tmp_path),
         (RUN_FILE, read_run_record, tmp_path),
     ):
         (tmp_path / name).write_bytes(contents)

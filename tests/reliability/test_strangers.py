@@ -25,7 +25,7 @@ from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.host.files import INDICES_FILE, PANELS_FILE, RUN_FILE, SKY_FILE, write_csv
 from agalign.host.text import without_controls
-from agalign.records.panels_and_sky import read_panels_and_sky
+from agalign.records.panels_and_sky import read_panels, read_sky
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar_file import find_sidecars
 from agalign.spectral_indices.indices_csv import read_table
@@ -44,7 +44,7 @@ def irregular(request: pytest.FixtureRequest) -> Callable[[Path], None]:
 
 
 @pytest.mark.parametrize(
-    ("name", "read"), [(RUN_FILE, read_run_record), (PANELS_FILE, read_panels_and_sky), (SKY_FILE, read_panels_and_sky)]
+    ("name", "read"), [(RUN_FILE, read_run_record), (PANELS_FILE, read_panels), (SKY_FILE, read_sky)]
 )
 def test_a_record_that_is_not_a_regular_file_is_an_error(
     tmp_path: Path, irregular: Callable[[Path], None], name: str, read: Callable[[Path], object]

@@ -23,7 +23,7 @@ from agalign.flight.panel_readings import BandReading, PanelReading, missing_pan
 from agalign.host.files import PANELS_FILE, SKY_FILE
 from agalign.host.own_files import is_own_file
 from agalign.records import cautions as run_cautions
-from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES, read_panels_and_sky
+from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES, last_panels_and_sky, read_panels, read_sky
 from agalign.report.pages import write_pages
 from agalign.report.panel_and_sky_files import _tile
 from agalign.values.capture import Band
@@ -91,7 +91,7 @@ def test_a_run_on_another_folder_keeps_the_panels_of_the_first(between_panels: P
         for path in (p for n in numbers for p in between_panels.rglob(f"IMG_000{n}_*.tif")):
             shutil.copyfile(path, folder / path.name)
         agalign.align_folder(folder, out, settings=seeded("rig"))
-        panels, _ = read_panels_and_sky(out)
+        panels = read_panels(out)
         names = [] if day == "day 1 again" else ["IMG_0001"]
         assert [panel.label for panel in panels] == names
         assert [path.name for path in out.rglob("*.panel.png")] == [f"{name}.panel.png" for name in names]
@@ -104,7 +104,7 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     with Image.open(folder / "IMG_0001.panel.png") as picture:
         assert (np.asarray(picture) == (255, 64, 32)).all(axis=-1).sum() > 5 * 50
     assert is_own_file(by_panel / PANELS_FILE, (PANEL_AND_SKY_FILES[PANELS_FILE],))
-    (first, last), _ = read_panels_and_sky(by_panel)
+    first, last = read_panels(by_panel)
     assert (first.capture, last.capture) == ("IMG_0001", "IMG_0004")
     assert [b.albedo for p in (first, last) for b in p.bands] == pytest.approx([0.51] * 10)
     assert first.sentence.endswith("irradiance 1.00 times that of the light sensor")
@@ -293,7 +293,7 @@ def test_the_sky_is_left_out_and_named(with_sky: Path, tmp_path: Path) -> None:
     (capture,) = (c for c in agalign.discover(with_sky).captures if c.label == "sky/S1")
     with pytest.raises(agalign.InputError, match=r"sky/S1: shows the sky; align another capture"):
         agalign.align_capture(capture, out)
-    _, (part,) = read_panels_and_sky(out)
+    (part,) = read_sky(out)
     assert (part.folder, part.capture, [b.band for b in part.bands]) == ("sky", "S1", ["Blue", "Green", "NIR"])
     assert part.cues == ["its folder or name contains 'sky'", "no band has texture"]
     assert not list(out.rglob("S1*"))
@@ -323,10 +323,15 @@ def test_info_names_the_sky(with_sky: Path) -> None:
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
     (tmp_path / SKY_FILE).write_text('{"schema": "agalign-sky/1"')
     with pytest.raises(SidecarError, match=r"sky\.json: cannot be read; delete it and run again"):
-        read_panels_and_sky(tmp_path)
+        read_sky(tmp_path)
     problems: list[str] = []
     write_pages(tmp_path, problems.append)
     assert len(problems) == 1
+    panel = {"folder": "", "capture": "panel", "captured_at": "", "bands": []}
+    panel |= {"seen_by": "QR code", "serial": "", "picture": "panel.panel.png"}
+    (tmp_path / PANELS_FILE).write_text(json.dumps({"schema": "agalign-panels/1", "panels": [panel]}))
+    panels, sky = last_panels_and_sky(tmp_path)  # which the next run keeps
+    assert ([part.capture for part in panels], sky) == (["panel"], [])
 
 
 def test_the_picture_of_a_panel_with_a_band_that_cannot_be_read_is_drawn(tmp_path: Path) -> None:

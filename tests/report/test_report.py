@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import tracemalloc
+from collections.abc import Callable
 from html import unescape
 from itertools import chain
 from pathlib import Path
@@ -82,9 +83,9 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
             assert details["lattices"][pair["lattice"]] == centres
 
 
-def headline(out: Path) -> str:
+def headline(out: Path, on_problem: Callable[[str], object] = pytest.fail) -> str:
     """The text of the page's first paragraph, after it is written again."""
-    write_pages(out, pytest.fail)
+    write_pages(out, on_problem)
     page = (out / "index.html").read_text(encoding="utf-8")
     return " ".join(re.sub("<[^>]+>", "", page.partition('<p class="verdict">')[2].partition("</p>")[0]).split())
 
@@ -111,6 +112,9 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert headline(out).startswith("8 of 8 band pairs are aligned.")
     without = f"2 of 4 captures have no result: {labels[2]}, {labels[3]}; the same command resumes it."
     assert f"The run was stopped before its end; {without}" in headline(out)
+    (out / "panels.json").write_text("{")  # another file that cannot be read changes nothing
+    assert f"The run was stopped before its end; {without}" in headline(out, str)
+    (out / "panels.json").unlink()
     assert [(r["capture"], r["status"]) for r in table_in(out / "summary.csv")[8:]] == [
         ("IMG_0003", "no_result"),
         ("IMG_0004", "no_result"),
@@ -444,13 +448,16 @@ def test_rigs_are_drawn_of_models_that_can_be_read(tmp_path: Path) -> None:
     assert "b.safetensors" in problem
 
 
-def test_the_share_of_saturated_pixels_of_a_band(tmp_path: Path) -> None:
-    plane = np.full((60, 80), 3, np.uint8)
-    plane[:10, :10] = 255
+@pytest.mark.parametrize("size_px", [(80, 60), (2592, 60)])
+def test_the_share_of_saturated_pixels_of_a_band(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """Every third pixel of a part, also of an image that is reduced for the screen."""
+    width, height = size_px
+    plane = np.full((height, width), 3, np.uint8)
+    plane[:10, : width // 2 : 3] = 255
     cv2.imwrite(str(tmp_path / "a.png"), plane)
-    band = Band("NIR", tmp_path / "a.png", 1, 80, 60, "uint8", saturation_value=255)
-    bands = read_reduced_bands(Capture("a", tmp_path, (band,), 0), {}, OutputGrid(0, 0, 80, 60))
-    assert bands.saturated == {"NIR": pytest.approx(100 / 4800)}
+    band = Band("NIR", tmp_path / "a.png", 1, width, height, "uint8", saturation_value=255)
+    bands = read_reduced_bands(Capture("a", tmp_path, (band,), 0), {}, OutputGrid(0, 0, width, height))
+    assert bands.saturated == {"NIR": pytest.approx((plane == 255).mean())}
 
 
 @pytest.mark.slow
