@@ -75,25 +75,25 @@ class DisplacementEstimator:
         self.verification = FixedWindows(valid, structure, verification_px)
 
     def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult | None:
-        """Fit the displacement field of a mapping, including the field that the mapping already has.
+        """Fit the displacement field of a mapping; far from all windows, it is the field that the mapping already has.
 
         The shifts are measured again with the field of each round until their median is at most 0.2 px, as correlation
         is sharper and large shifts are measured in steps. Returns no field if it folds the image or increases the p95
         of held-out windows beyond _MAX_P95_GROWTH; None if too few windows are measured.
         """
-        field = None if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
-        max_rounds, converged_px = 4, 0.2
+        zero = DisplacementField.sampled(np.zeros_like, self.lattice_px, self.size_px)
+        given = zero if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
+        field, max_rounds, converged_px = given, 4, 0.2
         for _ in range(max_rounds):
-            shifts = self._measure(moving, replace(mapping, field=field))
-            before_px = 0.0 if field is None else field(shifts.centres_px)
-            total = shifts._replace(shifts_px=shifts.shifts_px + before_px)
-            if len(total.weights) < MIN_WINDOWS:
+            shifts = self._measure(moving, mapping if field is zero else replace(mapping, field=field))
+            beyond_given_px = shifts.shifts_px + field(shifts.centres_px) - given(shifts.centres_px)
+            beyond_given = shifts._replace(shifts_px=beyond_given_px)
+            if len(shifts.weights) < MIN_WINDOWS:
                 return None
-            field = fitted_field(total, _SMOOTHNESS, self.lattice_px, self.size_px)
+            field = given.plus(fitted_field(beyond_given, _SMOOTHNESS, self.lattice_px, self.size_px))
             if np.median(shifts.distances_px()) <= converged_px:
                 break
-        assert field is not None
-        before, after = self._held_out(moving, mapping, field, total)
+        before, after = self._held_out(moving, mapping, field, given, beyond_given)
         is_verified = after.is_measured.any() and after.p95_px <= _MAX_P95_GROWTH * before.p95_px
         is_used = is_verified and _is_one_to_one(field, self.size_px)
         return DisplacementResult(field if is_used else None, before.p95_px, after.p95_px, after)
@@ -105,9 +105,15 @@ class DisplacementEstimator:
         return Shifts.of(residual)._replace(weights=np.minimum((_NOISE_PX / noise_px(peaks_sigma)) ** 2, _MAX_WEIGHT))
 
     def _held_out(
-        self, moving: Raster, mapping: PixelMapping, field: DisplacementField, total: Shifts
+        self,
+        moving: Raster,
+        mapping: PixelMapping,
+        field: DisplacementField,
+        given: DisplacementField,
+        beyond_given: Shifts,
     ) -> tuple[Residual, Residual]:
-        """Return the residuals of the verification windows without the field and, cross-validated, with it.
+        """Return the residuals of the verification windows without the field and, cross-validated, with it, which is
+        `given` with a field that is fitted to the shifts `beyond_given`.
 
         The shifts are measured with the complete mapping, for which correlation is sharp.
         """
@@ -115,8 +121,8 @@ class DisplacementEstimator:
         residual = self.verification.residuals(warped(moving, with_field, self.size_px))
         folds = every_nth(residual, _FOLDS)
         of_folds = (residual.centres_px[folds.numbers == fold] for fold in range(folds.count))
-        fields = [self._field_apart_from(of_fold, total) for of_fold in of_folds]
-        by_fold = [None if one is None else replace(mapping, field=one) for one in fields]
+        fields = [self._field_apart_from(of_fold, beyond_given) for of_fold in of_folds]
+        by_fold = [None if one is None else replace(mapping, field=given.plus(one)) for one in fields]
         after = held_out(residual, with_field, folds, by_fold)
         before_px = residual_under(residual, with_field, mapping).shifts_px
         before_px[~after.is_measured] = np.nan  # in the same windows

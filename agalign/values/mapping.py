@@ -68,6 +68,10 @@ class DisplacementField:
         """The same on an image that is resized by `scale`."""
         return replace(self, scale=self.scale.over(scale))
 
+    def plus(self, other: "DisplacementField") -> "DisplacementField":
+        """Return the sum of two fields on one lattice."""
+        return replace(self, displacements_px=self.displacements_px + other.displacements_px)
+
     def on_lattice(self, step_px: float, size_px: tuple[int, int]) -> "DisplacementField":
         """The same by its values on another lattice, which covers an image (width, height).
 

@@ -40,6 +40,18 @@ def test_the_field_vanishes_far_from_all_measurements() -> None:
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
 
 
+def test_the_given_field_continues_where_no_window_is() -> None:
+    """Half of the image has no texture; the lenses displace by 1.5 px there too, which no window shows."""
+    lenses = DisplacementField.sampled(lambda points: np.full_like(points, 1.5), 48, SIZE)
+    fixed, moving = displaced_views(lambda points: bump(points, 0.8) + np.where(points[..., :1] > -1e9, 1.5, 0))
+    known = fixed.valid & (np.arange(SIZE[0]) < 340)
+    estimator = DisplacementEstimator(known, structure_field(replace(fixed, valid=known)))
+    found = estimator.refine(moving, PixelMapping(np.eye(3), field=lenses)).field
+    np.testing.assert_allclose(found(np.array([[600.0, 100.0], [600.0, 400.0]])), 1.5, atol=0.1)
+    near = np.array([[300.0, 220.0]])
+    np.testing.assert_allclose(found(near), bump(near, 0.8) + 1.5, atol=0.2)
+
+
 def test_a_field_that_folds_the_image_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     fixed, moving = displaced_views(bump)
     estimator, mapping = DisplacementEstimator(fixed.valid, structure_field(fixed)), PixelMapping(np.eye(3))
