@@ -73,9 +73,10 @@ def _estimates(
     }
     if rig is not None:
         by_images = {name: joint for name, joint in estimates.items() if joint.corner_covariance_px2 is not None}
-        known = observation(pairs, by_images, capture)
+        # A mapping by descriptors that do not distinguish patches is no evidence of the others.
+        known = observation(pairs, {name: joint for name, joint in by_images.items() if joint.is_retrieved}, capture)
         for pair in pairs:
-            if pair.name in known.mappings and pair.name in rig.mean:
+            if pair.name in by_images and pair.name in rig.mean and pair.has_rig_pixels:
                 estimates[pair.name] = _with_prior(pair, by_images[pair.name], rig_prediction(pair, rig, known))
     return list(estimates.values())
 

@@ -91,6 +91,14 @@ def test_the_distance_is_estimated_from_the_band_with_texture() -> None:
     np.testing.assert_allclose(corners_near_the_mean(both["red"]), np.tile([3.0, 0.0], (4, 1)), atol=0.02)
 
 
+def test_a_band_whose_patches_are_not_found_again_is_no_evidence_of_the_others() -> None:
+    """Red without texture follows the mean of the flight, not the shift of NIR along its baseline."""
+    for retrieval, shift_px in ((1.0, 3.0), (0.02, 0.0)):
+        nir = replace(result([0.0, 4.0], 0.03), retrieval=retrieval, chance=0.01)
+        both = found_together(result(0, 50.0), nir, rig())
+        np.testing.assert_allclose(corners_near_the_mean(both["red"]), np.tile([shift_px, 0.0], (4, 1)), atol=0.1)
+
+
 @pytest.mark.parametrize(
     ("there", "std_px", "rig_px", "atol"),
     [([[1.2, 0.0], [0.0, 1.4], [-1.2, 0.0], [1.0, 1.0]], 0.03, 0.05, 0.05), ([[3.0, 4.0]] * 4, 0.4, 0.08, 0.3)],
