@@ -32,7 +32,7 @@ from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.evaluation.evaluate import elastix_affinity
 from agalign.fit.windows import FixedWindows
-from agalign.method.match import to_8_bit
+from agalign.method.learned_matches import to_8_bit
 from agalign.pixels.band_resampling import luma, warped
 from agalign.pixels.masks import raster_of
 from agalign.pixels.structure import structure_field

@@ -33,7 +33,7 @@ class Candidate:
     error: MappingError
     residual: Residual
     """Windows without their own part in the fit, by the rule of `fit.held_out`; descriptors and rig contribute to each
-    fit of a homography. Lens shapes are fitted to them: such a candidate only predicts.
+    fit of a homography. Under a relief, windows in other fields than those of the fit.
     """
     joint: JointResult | None = None
     """Evidence of descriptors or windows; None for a prediction by the rig."""
@@ -228,7 +228,7 @@ class RefinedBand:
 
 def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
     """Yield the homography with the p95 of both geometries, then the same with a displacement field, verified by
-    windows that it is not fitted to; without it if it increases their shifts, or if only the homography passes.
+    windows that it is not fitted to; without it if it increases their p95 too much, or if only the homography passes.
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)

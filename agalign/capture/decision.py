@@ -1,8 +1,8 @@
 """Which of its candidates a band gets, and the status that follows.
 
-The estimators leave out what they reject themselves: displacement fields that increase the shifts of held-out windows,
-and reliefs that fit fewer than half of the bands. `decide` chooses among the other candidates. For each band, the first
-row that applies:
+The estimators leave out what they reject themselves: displacement fields that increase the p95 of held-out windows by
+more than a twentieth, and reliefs that fit fewer than half of the bands. `decide` chooses among the other candidates.
+For each band, the first row that applies:
 
 | chosen                                    | if                                               | status      |
 |-------------------------------------------|--------------------------------------------------|-------------|

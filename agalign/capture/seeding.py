@@ -11,7 +11,7 @@ from agalign.config import SeedSettings
 from agalign.fit.window_fit import fit_in_rounds
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
-from agalign.method.match import match_seed, matching_network, starter_for_matching
+from agalign.method.learned_matches import match_seed, matching_network, starter_for_matching
 from agalign.method.state import ImageGroup, MovingImage
 from agalign.pixels.band_resampling import channel_mean, textured, warped
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography

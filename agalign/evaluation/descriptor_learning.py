@@ -21,8 +21,8 @@ from agalign.flight.model import FlightModel
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import BATCH, LEARNING_RATE, in_batch_loss
+from agalign.method.learned_matches import sift_keypoints, visible_in_both
 from agalign.method.levels import Level, make_level
-from agalign.method.match import sift_keypoints, visible_in_both
 from agalign.method.patches import Keypoints, far_apart, patch_positions
 from agalign.method.state import JointState, MovingImage
 from agalign.values import geometry

@@ -5,7 +5,7 @@ OpenDroneMap use it: on gradient magnitudes, over an image pyramid.
 import cv2
 import numpy as np
 
-from agalign.method.match import to_8_bit
+from agalign.method.learned_matches import to_8_bit
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Raster

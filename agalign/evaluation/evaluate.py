@@ -46,8 +46,8 @@ from agalign.host.text import without_formula
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
+from agalign.method.learned_matches import matching_network, sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.levels import make_level
-from agalign.method.match import matching_network, sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import align_by_paper, pyramid
 from agalign.method.patches import Keypoints, bilinear, patch_positions, transform
 from agalign.method.refine import refine

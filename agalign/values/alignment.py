@@ -69,7 +69,7 @@ class Seed:
     score: Number
     """Correlation at this mapping, in standard deviations; 0 if it replaced a seed that contradicts it."""
     peak_sigma: Number = 0.0
-    """Height of the correlation peak, in standard deviations."""
+    """The same as `score`; 0 without a correlation."""
     runner_up_sigma: Number = 0.0
     """Height of the second highest separate peak, in standard deviations."""
     trusted: bool = False
@@ -118,7 +118,8 @@ class JointResult:
     corner_std_xy_px: Annotated[tuple[tuple[UpToInfinity, UpToInfinity], ...], Field(min_length=4, max_length=4)]
     """Standard errors (x, y) at the corners of the reference, clockwise from the top left, px."""
     corner_covariance_px2: Annotated[NDArray[np.float64] | None, Field(exclude=True)] = None
-    """Their covariance; a sidecar has that of the mapping, in `error`."""
+    """Covariance of the corners of a homography, also if a simpler family was fitted; a sidecar has that of the
+    mapping, in `error`."""
 
     @property
     def corner_std_px(self) -> float:

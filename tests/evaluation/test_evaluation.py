@@ -17,7 +17,13 @@ from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.flight.model import load_model, save_model
 from agalign.method.descriptor import Descriptor
-from agalign.method.match import match_seed, matching_network, sift_keypoints, starter_for_matching, visible_in_both
+from agalign.method.learned_matches import (
+    match_seed,
+    matching_network,
+    sift_keypoints,
+    starter_for_matching,
+    visible_in_both,
+)
 from agalign.method.paper import Training
 from agalign.method.patches import patch_positions
 from agalign.values import geometry
