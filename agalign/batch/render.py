@@ -1,6 +1,7 @@
 """Rendering: the files of a capture, from its images and the result of its estimation.
 
-A product that an earlier command wrote is written again with the settings of this one, whether they ask for it or not.
+A product with an option that an earlier command wrote is written again with the settings of this one, whether they ask
+for it or not.
 One that cannot be written any more is removed, and the report of the capture names it.
 """
 

@@ -148,6 +148,7 @@ def plan_run(
 ) -> dict[str, str]:
     """Return what `run_flight` would do with each capture, by label. Writes nothing.
 
+    Only after learning is it known whether the crop of the flight changes, and finished captures are rendered again.
     Raises InputError and ConfigurationError like `run_flight` does.
     """
     run = _FlightRun(flight, out, settings, options or RunOptions())

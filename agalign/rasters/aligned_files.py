@@ -182,8 +182,9 @@ def write_raster(
     images by name where these need no reduction.
 
     The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
-    radiometric calibration. A nodata value is declared only if some pixel needs it; valid moving pixels that equal it
-    change by the smallest step. A COG gets no `tags`: tags that GDAL does not write itself would break its layout.
+    radiometric calibration. A nodata value is declared if the reference declares one, for floats, or if some pixel
+    needs it; valid moving pixels that equal it change by the smallest step. A COG gets no `tags`: tags that GDAL does
+    not write itself would break its layout.
     Raises OutputError, or UnreadableFileError for an input.
     """
     capture, settings, raw = context.capture, context.settings.write, context.is_raw

@@ -175,7 +175,8 @@ class Product(ABC):
     needs_layers: ClassVar[bool] = True
     """False if the product is also written for captures without usable moving bands."""
     option: ClassVar[str | None] = None
-    """Name of the setting in `WriteSettings` that requests the product; None if it is always written."""
+    """Name of the setting in `WriteSettings` that requests the product, and later commands need not repeat; None of the
+    pictures, and of the rasters that `layout` chooses."""
     text_starts: ClassVar[tuple[bytes, ...]] = ()
     """How its text files start; images have a mark instead (`host/own_files.py`)."""
 

@@ -98,7 +98,7 @@ class RunPart(_Part):
     """ISO 8601, UTC."""
     seconds: float
     input: str
-    """The input folder. Sidecars name images relative to it."""
+    """The input folder. Sidecars name images relative to it, but those of captures in `other_inputs`."""
     command: str = ""
     """The command line; empty for a run from Python."""
     cameras: list[CameraOverview] = []

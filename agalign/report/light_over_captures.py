@@ -27,7 +27,7 @@ _CORNERS, _MIDDLE = 0.75, 0.4
 _MAX_APART_S = 60.0
 """Between two captures that may show the same ground under the same light."""
 _RECENT = 16
-"""Captures that are kept for comparison: those of a run do not end in the order of their times."""
+"""Captures that are kept for comparison: the order of their names need not be that of their times."""
 _MIN_VALID = 0.5
 """Share of the cells of a band that are above the black level."""
 _MIN_OVERLAP = 0.4

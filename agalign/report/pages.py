@@ -136,6 +136,8 @@ def _captures(
 def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[tuple[Path, Sidecar, str]]:
     """Yield the results that the pages show: path and content of each sidecar, and the states of its files in the run
     record. Those that cannot be read, or are at the place of another capture, are reported to `on_problem`.
+
+    Edited ones count: their checksums take three times as long as reading them, and `agalign verify` finds them.
     """
     for path, states in counted_sidecars(find_sidecars(out), out).items():
         try:

@@ -1,4 +1,4 @@
-"""OUT/summary.csv: a row for each band of each capture."""
+"""OUT/summary.csv: a row for each moving band of each capture, and for a reference with something to check."""
 
 import math
 from typing import Any

@@ -89,7 +89,7 @@ def update_table(
 ) -> list[IndexReport]:
     """Write OUT/indices.csv: `rows`, and the `current_rows` of other captures and indices, which may be given.
 
-    Return all rows. An empty table is not written. Raises OutputError.
+    Return all rows. Without any, only an earlier table is written again, empty. Raises OutputError.
     """
     result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
     if result or read_table(out):
