@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import cycle
 
 import cv2
@@ -215,7 +215,7 @@ class _Band:
         """The residual of the held-out windows under the homography of the descriptors; that of the MAP estimate is
         fitted to windows that share pixels with them.
         """
-        return self.refined.relief_check_residual(self.refined.warped.mapping)
+        return self.refined.pair.reference.relief_check_windows.residuals(self.refined.warped.warped)
 
     def held_out(self, relief: Relief) -> WarpedPair:
         """Measure the windows that take no part in the fit, with a relief of other bands."""
@@ -374,10 +374,11 @@ class _Estimate:
             x, y = own * float((others * baselines).sum() / max((others**2).sum(), 1e-12))
             prior = BaselinePrior((x, y), layout_std)
         start = _Band(band, band.warped.mapping, prior.mean).mapping(self.relief)
-        if len(band.relief_fit_residual(start).measured_px) < MIN_WINDOWS:
+        fit_residual = partial(_fit_residual, band)
+        if len(fit_residual(start).measured_px) < MIN_WINDOWS:
             return None
         size_px, lens_std = band.pair.fixed.size_px, None if band.pair.has_rig else band.pair.lens_std_px
-        fitted = fit_in_rounds(start, band.relief_fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
+        fitted = fit_in_rounds(start, fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None
         return _Band(band, fitted[0].without_parallax, fitted[0].parallax.baseline, fitted[1].covariance_px2)
@@ -424,7 +425,7 @@ def _with_field_on_relief(candidate: Candidate) -> Candidate:
     assert candidate.error.covariance_px2 is not None
     with_field = replace(mapping, field=displacement.field)
     error = mapping_error(pair, with_field, candidate.error.covariance_px2, candidate.residual, mapping.field)
-    p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.after_p95_px}
+    p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.held_out.p95_px}
     of_field = displacement.held_out
     result = replace(candidate, mapping=with_field, error=error, other_residual=of_field, held_out_p95_px=p95_px)
     return candidate if result.issues and not candidate.issues else result
@@ -492,12 +493,17 @@ def _std_px(reliefs: Sequence[Relief], max_std_px: float) -> FloatImage:
     return np.asarray(median_px / np.sqrt(1 + np.square(median_px / max_std_px)), np.float32)
 
 
+def _fit_residual(band: RefinedBand, mapping: PixelMapping) -> Residual:
+    """Measure the windows of the fit with a mapping."""
+    return band.pair.reference.relief_fit_windows.residuals(band.warped_moving(mapping))
+
+
 def _window_shifts(
     bands: Sequence[_Band], relief: Relief | None = None, *, with_lens_shapes: bool = False
 ) -> WindowShifts:
     """Measure the windows of the fit with the planes of the bands, or with a relief."""
     mappings = [b.plane if relief is None else b.mapping(relief) for b in bands]
-    residuals = [b.refined.relief_fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
+    residuals = [_fit_residual(b.refined, m) for b, m in zip(bands, mappings, strict=True)]
     return WindowShifts.of(residuals, mappings, with_lens_shapes=with_lens_shapes)
 
 

@@ -214,15 +214,8 @@ class RefinedBand:
                 return replace(self, joint=replace(joint, fixed_to_moving=given), by_fold=())
         return self
 
-    def relief_fit_residual(self, mapping: PixelMapping) -> Residual:
-        """Measure the windows of the fit with a mapping."""
-        return self.pair.reference.relief_fit_windows.residuals(self._warped(mapping))
-
-    def relief_check_residual(self, mapping: PixelMapping) -> Residual:
-        """Measure the windows that take no part in the fit."""
-        return self.pair.reference.relief_check_windows.residuals(self._warped(mapping))
-
-    def _warped(self, mapping: PixelMapping) -> Raster:
+    def warped_moving(self, mapping: PixelMapping) -> Raster:
+        """Warp the moving image; under the mapping of `warped`, that is done."""
         return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
 
 
@@ -235,7 +228,7 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
     if displacement is None:
         yield plane
         return
-    p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
+    p95_px: dict[Geometry, float] = {"homography": displacement.before.p95_px, "field": displacement.held_out.p95_px}
     yield replace(plane, held_out_p95_px=p95_px)
     if displacement.field is None:
         return

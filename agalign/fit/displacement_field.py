@@ -54,10 +54,10 @@ class DisplacementResult:
     """A displacement field, and its effect on the residual of held-out windows; no field if that grows too much."""
 
     field: DisplacementField | None
-    before_p95_px: float
-    after_p95_px: float
-    held_out: Residual | None = None
-    """Residual of held-out windows: each field is fitted without the window and those that overlap it."""
+    before: Residual
+    """Held-out windows without the field."""
+    held_out: Residual
+    """The same windows, each under a field that is fitted without its fold."""
 
 
 class DisplacementEstimator:
@@ -96,7 +96,7 @@ class DisplacementEstimator:
         before, after = self._held_out(moving, mapping, field, given, beyond_given)
         is_verified = after.is_measured.any() and after.p95_px <= _MAX_P95_GROWTH * before.p95_px
         is_used = is_verified and _is_one_to_one(field, self.size_px)
-        return DisplacementResult(field if is_used else None, before.p95_px, after.p95_px, after)
+        return DisplacementResult(field if is_used else None, before, after)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
         """Measure the windows; their weights are relative to one with a noise of _NOISE_PX."""

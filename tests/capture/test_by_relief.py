@@ -584,7 +584,7 @@ def test_a_field_on_a_relief_is_verified_by_windows_that_it_is_not_fitted_to(
     field = DisplacementField(48.0, np.zeros((20, 20, 2)))
     for shift_px, is_used in ((0.1, True), (3.0, False)):
         held_out = residual_of(under.residual.centres_px, np.array([shift_px, 0.0]))
-        found = DisplacementResult(field, 1.0, 0.5, held_out)
+        found = DisplacementResult(field, under.residual, held_out)
         monkeypatch.setattr(DisplacementEstimator, "refine", lambda *_, found=found: found)
         assert (_with_field_on_relief(under) is not under) == is_used
 

@@ -25,7 +25,17 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import INACCURATE, REPEATS, RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField
 
-from ..builders import decided, displaced_views, estimation_of, joint_result, pair_of, texture, two_views, whole
+from ..builders import (
+    decided,
+    displaced_views,
+    estimation_of,
+    joint_result,
+    pair_of,
+    residual_of,
+    texture,
+    two_views,
+    whole,
+)
 
 TRUTH = geometry.translation(6, -4)
 SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
@@ -101,7 +111,9 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     """A field that leaves the windows misaligned must not be accepted."""
     wild = np.zeros((11, 14, 2))
     wild[..., 0] = 3.0
-    result = DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5)
+    centres_px = pair.windows.centres_px
+    before, held_out = (residual_of(centres_px, (shift_px, 0.0)) for shift_px in (1.0, 0.5))
+    result = DisplacementResult(DisplacementField(32.0, wild), before, held_out)
     monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_, **__: result)
     results = aligned(pair, GOOD, "always")
     assert (results.status, results.geometry) == ("aligned", "homography")
@@ -117,7 +129,7 @@ def test_a_field_that_its_held_out_windows_reject_does_not_replace_a_verified_ho
     """The windows of the homography say nothing about it."""
     windows = WarpedPair.of(pair, pair.mapping(TRUTH)).residual
     rejected = windows.with_shifts(windows.shifts_px + 1.5)
-    result = DisplacementResult(DisplacementField(32.0, np.full((11, 14, 2), 0.2)), 1.0, 0.5, rejected)
+    result = DisplacementResult(DisplacementField(32.0, np.full((11, 14, 2), 0.2)), windows, rejected)
     monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: result)
     results = aligned(pair, GOOD, "always")
     assert (results.status, results.geometry) == ("aligned", "homography")

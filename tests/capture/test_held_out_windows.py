@@ -104,7 +104,7 @@ def test_windows_that_verify_a_field_share_no_pixels_with_those_of_the_fit(borde
     flat, nowhere = PixelMapping(geometry.identity()), DisplacementField(24.0, np.zeros((21, 28, 2)))
 
     def held_out(shifts_px: np.ndarray) -> Residual:
-        return estimator._held_out(moving, flat, nowhere, Shifts.of(fitted.with_shifts(shifts_px)))[1]
+        return estimator._held_out(moving, flat, nowhere, nowhere, Shifts.of(fitted.with_shifts(shifts_px)))[1]
 
     before = held_out(noise_px)
     for chosen in rng.permutation(len(before.centres_px))[:5]:

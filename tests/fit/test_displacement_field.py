@@ -66,7 +66,7 @@ def test_the_p95_before_and_after_a_field_are_over_the_same_windows(monkeypatch:
     """Those near the bump lack a prediction, as by too few neighbours."""
     fixed, moving = displaced_views(bump)
     estimator = DisplacementEstimator(fixed.valid, structure_field(fixed))
-    assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px > 0.9
+    assert estimator.refine(moving, PixelMapping(np.eye(3))).before.p95_px > 0.9
 
     zero = DisplacementField(24.0, np.zeros((21, 28, 2)))
 
@@ -75,7 +75,7 @@ def test_the_p95_before_and_after_a_field_are_over_the_same_windows(monkeypatch:
 
     monkeypatch.setattr(estimator, "_field_apart_from", far_from_bump)
     monkeypatch.setattr(displacement_field, "every_nth", lambda residual, _: one_by_one(residual))
-    assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px < 0.3
+    assert estimator.refine(moving, PixelMapping(np.eye(3))).before.p95_px < 0.3
 
 
 def test_without_windows_there_is_no_p95() -> None:
@@ -121,7 +121,7 @@ def test_a_field_without_held_out_windows_is_rejected(monkeypatch: pytest.Monkey
     monkeypatch.setattr(DisplacementEstimator, "_field_apart_from", lambda *_: None)
     image = texture(*SIZE)
     result = DisplacementEstimator(image.valid, structure_field(image)).refine(image, PixelMapping(np.eye(3)))
-    assert (result.field, result.after_p95_px) == (None, np.inf)
+    assert (result.field, result.held_out.p95_px) == (None, np.inf)
 
 
 def test_a_field_that_clearly_increases_p95_is_rejected() -> None:
