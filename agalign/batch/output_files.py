@@ -45,7 +45,7 @@ class State(Enum):
     AS_LISTED = "in a sidecar that was not edited, with this size", "write", "remove"
     WITH_MARK = "file with the mark of the program, or empty", "write", "remove"
     CHANGED = "listed with another size, without mark; other JSON where a sidecar was", "write", "keep"
-    OF_USER = "any other file, or a folder", "refuse", "keep"
+    OF_USER = "any other file", "refuse", "keep"
     OTHER_RESULT = "sidecar of another capture, or of a version with another schema", "refuse", "refuse"
     IMAGE = "image of the input", "refuse", "refuse"
     TAKEN = "output of another capture of the run, with a name that differs at most in case", "refuse", "refuse"
@@ -127,7 +127,7 @@ class _Names:
 def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
     """Return the state of the file of a product, given the sizes of the listed files."""
     if not path.is_file():
-        return _no_file(path)
+        return State.NO_FILE, ""
     if path.stat().st_size == listed.get(path):
         return State.AS_LISTED, ""
     if is_own(path):
@@ -135,16 +135,10 @@ def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
     return (State.CHANGED, "") if path in listed else (State.OF_USER, foreign(path))
 
 
-def _no_file(path: Path) -> _Found:
-    """Return the state of a path at which no file is."""
-    is_folder = path.is_dir() and not path.is_symlink()
-    return (State.OF_USER, foreign(path)) if is_folder else (State.NO_FILE, "")
-
-
 def _sidecar(path: Path, capture: Capture, out: Path, read: ReadSidecar) -> _Found:
     """Return the state of the path of the sidecar of a capture."""
     if not path.is_file():
-        return _no_file(path)
+        return State.NO_FILE, ""
     try:
         earlier, _ = read(path)
     except OtherSchemaError as error:

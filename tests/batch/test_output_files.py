@@ -70,11 +70,6 @@ def of_user(case: Case) -> Case:
     return Path(shutil.copy(case[1][0].reference.path, case[0])), case[1]
 
 
-def folder(case: Case) -> Case:
-    case[0].mkdir()
-    return case
-
-
 def of_user_in_an_edited_sidecar(case: Case) -> Case:
     path, captures = of_user(case)
     sidecar = read_sidecar(path.with_name("f.json"))
@@ -117,7 +112,6 @@ def too_long(case: Case) -> Case:
         (as_listed, State.AS_LISTED, "write", "remove"),
         (with_mark, State.WITH_MARK, "write", "remove"),
         (changed, State.CHANGED, "write", "keep"),
-        (folder, State.OF_USER, "was not written by agalign", "keep"),
         (of_user, State.OF_USER, "was not written by agalign", "keep"),
         (of_user_in_an_edited_sidecar, State.OF_USER, "was not written by agalign", "keep"),
         (other_result, State.OTHER_RESULT, "belongs to a different capture", "belongs to a different capture"),
