@@ -39,9 +39,10 @@ class RigPrediction:
     """Of the reference plane."""
     parallax: Parallax | None = None
     """The relief of the capture, with the baseline of the rig."""
+    baseline_std: float = 0.0
+    """Standard error of that baseline, px per px of parallax; that of the relief is in `parallax`."""
     relief_std_px: float = 0.0
-    """Error by that baseline, or by the relief that the mapping lacks, px of the fixed image; that of the relief itself
-    is in `parallax`."""
+    """Error by the relief that a mapping without one lacks, px of the fixed image."""
 
     @property
     def fixed_to_moving(self) -> Matrix:
@@ -62,7 +63,8 @@ class RigPrediction:
     def error(self) -> MappingError:
         """Its error: of the reference plane, of the baseline or the missing relief, and of the relief."""
         std_px = math.hypot(self.std_px(self.fixed_to_moving), self.relief_std_px)
-        return MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=self.parallax)
+        size_px, baseline_std = self.pair.fixed.size_px, self.baseline_std
+        return MappingError(size_px, rig_std_px=std_px, parallax=self.parallax, baseline_std=baseline_std)
 
     @property
     def is_delivered(self) -> bool:
@@ -150,12 +152,12 @@ def rig_predictions(
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
     predictions: dict[str, RigPrediction] = {}
     for pair in covered:
-        parallax, relief_std_px = _parallax_by_rig(pair, parallaxes, rig)
-        if parallax is None:  # a homography does not follow the relief that captures of the flight have
-            relief_std_px = pair.relief_std_px
+        parallax, baseline_std = _parallax_by_rig(pair, parallaxes, rig)
+        # A homography does not follow the relief that captures of the flight have.
+        relief_std_px = pair.relief_std_px if parallax is None else 0.0
         # The plane of a result, which is compared with the prediction, is not displaced by the relief.
         predictions[pair.name] = replace(
-            rig_prediction(pair, rig, known), parallax=parallax, relief_std_px=relief_std_px
+            rig_prediction(pair, rig, known), parallax=parallax, baseline_std=baseline_std, relief_std_px=relief_std_px
         )
     return predictions
 
@@ -163,8 +165,8 @@ def rig_predictions(
 def _parallax_by_rig(
     pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
 ) -> tuple[Parallax | None, float]:
-    """Return the relief of the other bands with the baseline of the rig, and the standard error that the baseline
-    causes; that of the relief is in the relief. None and 0 without a relief, or if its bands do not determine it.
+    """Return the relief of the other bands with the baseline of the rig, and the standard error of the baseline; that
+    of the relief is in the relief. None and 0 without a relief, or if its bands do not determine it.
 
     t_b and d_b of a rig with delays are orthogonal (`learn_rig`), and the baselines of its lenses are s t_b + d_b k, in
     which s and k (2,) are equal for all bands.
@@ -186,6 +188,6 @@ def _parallax_by_rig(
     mean_square = float(np.square(seen - design @ solution).sum()) / degrees_of_freedom
     variance = float(expected_square(mean_square, degrees_of_freedom))
     own = rig.baseline_design(pair.name)
-    error = math.sqrt(variance * (2 + float(np.trace(own @ np.linalg.inv(design.T @ design) @ own.T))))
+    std = math.sqrt(variance * (2 + float(np.trace(own @ np.linalg.inv(design.T @ design) @ own.T))))
     x, y = (own @ solution).tolist()
-    return Parallax(relief, (x, y)).with_occlusions(), error * relief.rms_px
+    return Parallax(relief, (x, y)).with_occlusions(), std

@@ -45,6 +45,7 @@ from agalign.values.fields import (
     Number,
     Number3,
     Number4,
+    Number6,
     PointsPx,
     Positive,
     RelativeFile,
@@ -72,7 +73,7 @@ Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 7)]
 """They are multiplied by the parallax and by its square: 0.0005 px of rounding each for 100 px."""
 _SAME_IN_ALIGNMENT = "issues", "seed", "joint", "prediction", "seconds"
 """What a band has as its alignment has it; the rest has other names in a file, or is divided differently."""
-_SAME_IN_ERROR = "covariance_px2", "rig_std_px", "lens_std_px", "field_std_px", "relief_std_px", "moved"
+_SAME_IN_ERROR = "covariance_px2", "rig_std_px", "lens_std_px", "field_std_px", "relief_std_px", "moved", "baseline_std"
 """What the entry of an error has as the error has it."""
 
 
@@ -227,6 +228,8 @@ class ErrorPart(_Part):
     """Spread of the displacement field."""
     relief_std_px: Number4 = 0.0
     """Spread of the parallax that a mapping without it lacks, where no window is near."""
+    baseline_std: Number6 = 0.0
+    """Standard error of a predicted baseline, px per px of parallax."""
     moved: tuple[MovedArea, ...] = ()
     """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
 

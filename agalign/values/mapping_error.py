@@ -48,7 +48,7 @@ class MappingError:
 
     D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 near the measured windows to 1, u is
     the displacement that the mapping does not contain, by the residual shifts of the nearest windows beyond their
-    noise, z the standard error of the parallax times the baseline, and m the shift of an area that moved.
+    noise, z the error by those of the parallax and of the baseline, and m the shift of an area that moved.
 
     Examples
     --------
@@ -78,6 +78,8 @@ class MappingError:
     """Spread of the relief, which a mapping without one lacks where no window is near."""
     parallax: Parallax | None = None
     """Parallax of the mapping, with its standard error."""
+    baseline_std: float = 0.0
+    """Standard error of the baseline of a prediction, x and y together, px per px of parallax."""
     moved: tuple[MovedArea, ...] = ()
     """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
 
@@ -101,7 +103,9 @@ class MappingError:
         >>> result.error.error_px(np.array([[100.0, 100.0]])).shape
         (1,)
         """
-        z_px2 = np.zeros(len(points_px)) if self.parallax is None else self.parallax.variance_px2(points_px)
+        z_px2 = np.zeros(len(points_px))
+        if self.parallax is not None:
+            z_px2 = self.parallax.variance_px2(points_px, self.baseline_std)
         local_px2 = np.maximum(z_px2, np.square(moved_px(self.moved, *points_px.T)))
         return _error_px(*self.parts_px2(points_px), local_px2)
 
@@ -300,8 +304,9 @@ class ErrorOnGrid:
 
     def _z_px2(self, parallax: Parallax, tile: Tile) -> FloatImage:
         if self.is_along_axes:
-            return parallax.variance_at_crossings(*self._crossings(tile))
-        return np.asarray(parallax.variance_px2(self._points(tile)).reshape(tile.height, tile.width), np.float32)
+            return parallax.variance_at_crossings(*self._crossings(tile), self.error.baseline_std)
+        variance = parallax.variance_px2(self._points(tile), self.error.baseline_std)
+        return np.asarray(variance.reshape(tile.height, tile.width), np.float32)
 
     def _crossings(self, tile: Tile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return x of the columns and y of the rows of a tile in the reference, for a grid along its axes."""

@@ -150,21 +150,27 @@ class Parallax:
         baseline = (self.baseline[0] * scale.x / scale.mean, self.baseline[1] * scale.y / scale.mean)
         return replace(self, relief=self.relief.rescaled(scale), baseline=baseline)
 
-    def variance_px2(self, points_px: ArrayLike) -> NDArray[np.float64]:
-        """Variance (...) of the displacement by the error of the relief at raw points (..., 2), 0 if unknown."""
-        relief = self.relief
-        if relief.std_px is None:
-            return np.zeros(np.shape(points_px)[:-1])
-        std_px = replace(relief, parallax_px=relief.std_px)(points_px)
-        return np.asarray((std_px * np.hypot(*self.baseline)) ** 2)
+    def variance_px2(self, points_px: ArrayLike, baseline_std: float = 0.0) -> NDArray[np.float64]:
+        """Variance (...) of the displacement at raw points (..., 2): by the error of the relief, 0 if unknown, and by
+        that of the baseline, in its unit.
+        """
+        relief, variance = self.relief, np.zeros(np.shape(points_px)[:-1])
+        if relief.std_px is not None:
+            std_px = replace(relief, parallax_px=relief.std_px)(points_px)
+            variance = np.asarray((std_px * np.hypot(*self.baseline)) ** 2)
+        return variance + np.square(baseline_std * relief(points_px)) if baseline_std else variance
 
-    def variance_at_crossings(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> FloatImage:
+    def variance_at_crossings(
+        self, x_px: NDArray[np.float64], y_px: NDArray[np.float64], baseline_std: float = 0.0
+    ) -> FloatImage:
         """Return the same (m, n) at all crossings of columns x (n,) and rows y (m,), faster than at points."""
-        relief = self.relief
-        if relief.std_px is None:
-            return np.zeros((len(y_px), len(x_px)), np.float32)
-        std_px = replace(relief, parallax_px=relief.std_px).at_crossings(x_px, y_px)
-        return np.asarray(np.square(std_px * np.float32(np.hypot(*self.baseline))))
+        relief, variance = self.relief, np.zeros((len(y_px), len(x_px)), np.float32)
+        if relief.std_px is not None:
+            std_px = replace(relief, parallax_px=relief.std_px).at_crossings(x_px, y_px)
+            variance = np.asarray(np.square(std_px * np.float32(np.hypot(*self.baseline))))
+        if baseline_std:
+            variance = variance + np.square(np.float32(baseline_std) * relief.at_crossings(x_px, y_px))
+        return variance
 
     def displacements(self, points_px: ArrayLike) -> NDArray[np.float64]:
         """t_b z (..., 2) at raw points (..., 2), undistorted px."""

@@ -533,9 +533,9 @@ def test_the_error_of_a_baseline_by_one_other_band_is_known_to_a_factor_only(
     baselines = {**dict.fromkeys(names, (0.0, 0.0)), other.name: (0.8, 0.0), own.name: (0.0, 0.6)}
     rig = Rig(boxes.size_px, dict.fromkeys(names, np.eye(3)), baselines, nothing, nothing, ("distance",), (), nothing)
     off = 0.1  # across the baseline by the rig
-    parallax, std_px = _parallax_by_rig(own, [(other, Parallax(relief, (0.8, off)))], rig)
+    parallax, std = _parallax_by_rig(own, [(other, Parallax(relief, (0.8, off)))], rig)
     assert parallax.baseline == pytest.approx((0.0, 0.6))
-    assert std_px == pytest.approx(np.sqrt(3 * off**2 * (2 + (0.6 / 0.8) ** 2)) * relief.rms_px)
+    assert std == pytest.approx(np.sqrt(3 * off**2 * (2 + (0.6 / 0.8) ** 2)))
 
 
 @pytest.mark.full

@@ -155,6 +155,21 @@ def test_the_fields_between_windows_that_verify_a_relief_are_near() -> None:
     assert (replace(error, parallax=with_steps())._far(black_px) < 0.1).all()
 
 
+@pytest.mark.parametrize("relief_std_px", [None, 0.3])
+def test_the_error_of_a_predicted_baseline_grows_with_the_parallax(relief_std_px: float | None) -> None:
+    """An object near the camera is off by more than the plane, whose parallax is 0."""
+    z_px = np.zeros(SIZE[::-1], np.float32)
+    z_px[100:200, 300:400] = 20.0
+    std_px = None if relief_std_px is None else np.full_like(z_px, relief_std_px)
+    parallax = Parallax(Relief(z_px, np.ones_like(z_px), std_px=std_px), (0.6, 0.8))
+    error = MappingError(SIZE, rig_std_px=0.1, parallax=parallax, baseline_std=0.02)
+    of_relief = relief_std_px or 0.0
+    expected = [np.hypot(0.1, of_relief), np.sqrt(0.1**2 + of_relief**2 + (0.02 * 20) ** 2)]
+    np.testing.assert_allclose(error.error_px(np.array([[50.0, 50.0], [350.0, 150.0]])), expected, rtol=1e-6)
+    on_grid = ErrorOnGrid.of(error, SIZE).on_tile(Tile(0, 0, *SIZE))
+    np.testing.assert_allclose([on_grid[50, 50], on_grid[150, 350]], expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize("parallax", [None, with_steps(), with_steps(HALF)])
 def test_the_error_on_a_grid_is_that_of_its_pixels(parallax: Parallax | None) -> None:
     """This also holds on a tile, and on a grid that differs from the reference's, with axes bent by a lens."""
