@@ -165,8 +165,8 @@ def rig_predictions(
 def _parallax_by_rig(
     pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
 ) -> tuple[Parallax | None, float]:
-    """Return the relief of the other bands with the baseline of the rig, and the standard error of the baseline; that
-    of the relief is in the relief. None and 0 without a relief, or if its bands do not determine it.
+    """Return the relief of the other bands with the baseline of the rig, and the standard error of this baseline. The
+    result is None and 0 without a relief, or if its bands do not determine the baseline.
 
     t_b and d_b of a rig with delays are orthogonal (`learn_rig`), and the baselines of its lenses are s t_b + d_b k, in
     which s and k (2,) are equal for all bands.

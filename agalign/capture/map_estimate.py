@@ -73,7 +73,7 @@ def _estimates(
     }
     if rig is not None:
         by_images = {name: joint for name, joint in estimates.items() if joint.corner_covariance_px2 is not None}
-        # A mapping by descriptors that do not distinguish patches is no evidence of the others.
+        # Only bands whose descriptors are retrieved predict the other bands.
         known = observation(pairs, {name: joint for name, joint in by_images.items() if joint.is_retrieved}, capture)
         for pair in pairs:
             if pair.name in by_images and pair.name in rig.mean and pair.has_rig_pixels:

@@ -23,7 +23,7 @@ class Folds:
     """The folds of the windows of a residual."""
 
     numbers: NDArray[np.int64]
-    """(n,) the fold of each window, from 0."""
+    """(n,) the fold of each window, from 0; -1 for a window in no fold."""
     count: int
 
 
@@ -39,8 +39,9 @@ def every_nth(residual: Residual, n: int) -> Folds:
 
 
 def one_by_one(residual: Residual) -> Folds:
-    """Return a fold for each window."""
-    return Folds(np.arange(len(residual.cells)), len(residual.cells))
+    """Return a fold for each measured window; the others are in none."""
+    measured = residual.is_measured
+    return Folds(np.where(measured, np.cumsum(measured) - 1, -1), int(measured.sum()))
 
 
 def remaining(residual: Residual, folds: Folds, side_px: float) -> Iterator[Residual]:

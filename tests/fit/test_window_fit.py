@@ -110,6 +110,12 @@ def test_an_overlapping_window_is_verified_without_those_that_share_pixels_with_
     assert np.abs(change_px[distance_px >= side_px]).max() > 1e-4
 
 
+def test_windows_without_a_shift_are_in_no_fold() -> None:
+    residual = residual_of(CENTRES[:4], np.array([[1.0, 0.0], [np.nan, np.nan], [0.0, 1.0], [np.nan, np.nan]]))
+    folds = one_by_one(residual)
+    assert (folds.numbers.tolist(), folds.count) == ([0, -1, 1, -1], 2)
+
+
 @pytest.mark.parametrize("magnification", [1.0, 0.1])
 def test_the_limit_of_a_correction_is_for_all_rounds_together(magnification: float) -> None:
     """Windows that are shifted by 2 px again after each correction lead away from the seed."""
