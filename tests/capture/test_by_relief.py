@@ -522,6 +522,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     np.testing.assert_allclose(
         predictions["Blue"].mapping.parallax.baseline, aligned["Blue"].mapping.parallax.baseline, atol=0.05
     )
+    assert result["Blue"].error.baseline_std == predictions["Blue"].baseline_std > 0
 
 
 def test_the_error_of_a_baseline_by_one_other_band_is_known_to_a_factor_only(

@@ -2,7 +2,7 @@
 
 import runpy
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +289,13 @@ def test_a_field_of_reduced_images_is_rebuilt(tmp_path: Path) -> None:
     field = DisplacementField(48.0, nodes / nodes.std())
     alignment = aligned(PixelMapping(H, field=field), (640, 480)).in_file_px(REDUCED, FILE_PX)
     assert np.abs(rebuilt(alignment, tmp_path).map(POINTS) - alignment.map(POINTS)).max() < 0.02
+
+
+def test_all_parts_of_an_error_are_rebuilt(tmp_path: Path) -> None:
+    numbers = {f.name: 0.1 + 0.01 * i for i, f in enumerate(fields(MappingError)) if f.type is float}
+    assert len(numbers) == 4
+    error = rebuilt(aligned(PixelMapping(H), FILE_PX, error=MappingError(FILE_PX, **numbers)), tmp_path).error
+    assert {name: getattr(error, name) for name in numbers} == pytest.approx(numbers)
 
 
 def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
