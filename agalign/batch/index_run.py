@@ -105,11 +105,10 @@ def run_indices(
     rows: list[IndexReport] = []
     try:
         with open_workers(executor, processes, cv2.setNumThreads, preload=__name__) as run_tasks:
-            if run_tasks is not serially:
-                tasks = [task.absolute() for task in tasks]
-            for number, result in run_tasks(do_indices, tasks):
+            sent = tasks if run_tasks is serially else [task.absolute() for task in tasks]
+            for number, result in run_tasks(do_indices, sent):
                 try:
-                    reports = result()
+                    reports = [report.below(tasks[number].target) for report in result()]
                 except Exception as error:
                     reports = _failed(tasks[number], failure_text(error))
                 rows += reports

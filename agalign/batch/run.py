@@ -501,7 +501,7 @@ def capture_reports(
     if run_tasks is not serially:
         for number, result in run_tasks(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
             try:
-                report = result()
+                report = result().below(tasks[number].out)
             except Exception as error:
                 report = CaptureReport(tasks[number].capture.label, "error", error=failure_text(error, timeout_s))
             yield report

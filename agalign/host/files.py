@@ -109,6 +109,11 @@ def remove_companions(path: Path) -> None:
                 path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
+def below_as_given(path: Path, folder: Path) -> Path:
+    """Return a path below a folder with the folder as the user gave it: workers get and return absolute paths."""
+    return folder / path.relative_to(folder.absolute()) if path.is_absolute() else path
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically, with line feeds on every system. Raises OutputError."""
     with complete_file(path) as partial:

@@ -19,6 +19,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.flight.fingerprint import hashed
+from agalign.host.files import below_as_given
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
@@ -137,6 +138,10 @@ class IndexReport:
         """Identify the row in the table: (folder, capture, index)."""
         label = PurePosixPath(self.capture)
         return label.parent.as_posix(), label.name, self.index
+
+    def below(self, folder: Path) -> "IndexReport":
+        """Return the report of a worker, whose path is absolute, with its path below a folder as it was given."""
+        return self if self.path is None else replace(self, path=below_as_given(self.path, folder))
 
     def of(self, sidecar: Sidecar) -> "IndexReport":
         """Return the report with the time and the position of its capture."""

@@ -20,7 +20,7 @@ import pytest
 import agalign
 from agalign.batch import workers
 from agalign.batch.capture_report import CaptureReport
-from agalign.batch.capture_task import Task
+from agalign.batch.capture_task import Task, do_capture
 from agalign.batch.run import Listener, capture_reports, run_flight
 from agalign.batch.workers import (
     DaskExecutor,
@@ -35,6 +35,7 @@ from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
+from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar_file import find_sidecars, read_checked
 
 from ..conftest import raising, seeded
@@ -100,6 +101,19 @@ def seeds_only(flight: Path, out: Path) -> list[Task]:
 
 def reports_of(run: RunTasks, tasks: list[Task]) -> Iterator[CaptureReport]:
     return capture_reports(run, tasks, Listener(), timeout_s=600)
+
+
+def test_paths_of_workers_are_below_the_folder_as_it_was_given(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    task, _ = seeds_only(flight, Path("out"))
+    sidecar = CapturePaths.of(task.capture, task.out).sidecar
+    do_capture(task)
+    with ThreadPoolExecutor(1) as threads:
+        (report,) = reports_of(on_executor(threads), [replace(task, settings=seeded(layout="bands"))])
+    assert (report.path, report.removed) == (sidecar, ((sidecar.with_suffix(".tif"), "--layout bands"),))
+    assert not sidecar.is_absolute()
 
 
 def deadly(task: Task, folder: Path, times: int) -> Task:

@@ -3,6 +3,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -473,6 +474,15 @@ def test_the_output_folder_of_the_run_may_be_spelled_differently(
     listed = [part.file for part in read_sidecar(tmp_path / "out" / "0000SET" / "IMG_0001.json").products]
     assert {"IMG_0001_a.tif", "IMG_0001_b.tif"} <= {*listed}
     assert "IMG_0001_b.png" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_paths_of_workers_are_below_the_folder_as_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_aligned(tmp_path / "out", 1)
+    monkeypatch.chdir(tmp_path)
+    tasks = index_tasks(Path("out"), [INDICES["ndvi"]], Path("out"))
+    with ThreadPoolExecutor(1) as executor:
+        [(report,)] = run_indices(tasks, executor=executor)
+    assert report.path == Path("out/0000SET/IMG_0001_ndvi.tif")
 
 
 def test_lost_workers_do_not_cost_the_finished_indices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
