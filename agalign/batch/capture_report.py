@@ -61,7 +61,7 @@ class CaptureReport:
     """Processing time by (band, stage), s."""
 
     def below(self, out: Path) -> "CaptureReport":
-        """Return the report of a worker, which has absolute paths, with paths below an output folder as it was given."""
+        """Return the report of a worker, whose paths are absolute, with paths below a folder as it was given."""
         removed = tuple((below_as_given(path, out), reason) for path, reason in self.removed)
         return replace(self, path=None if self.path is None else below_as_given(self.path, out), removed=removed)
 

@@ -131,19 +131,21 @@ def sharpened(
     file: OpenRaster, bands: Sequence[Band], pan: Sequence[Band], scale: float, *, is_raw: bool
 ) -> tuple[list[LayerDescription], Iterator[Block]]:
     """Return the sharpened bands, given a file of the resampled `bands` followed by the panchromatic ones, which have
-    pixels `scale` times smaller. Raw numbers include the black level, and Brovey ratios are ratios of light.
+    pixels `scale` times smaller. Raw numbers include the black level and the offset of the file, and Brovey ratios are
+    ratios of light.
     """
     count, dtype, nodata = len(bands), np.dtype(file.dtypes[0]), file.nodata
     radiometry = [b.radiometry if is_raw else None for b in (*bands, *pan)]
-    black_levels = np.array([0.0 if r is None else r.black_level for r in radiometry], np.float32)
+    without_light = np.array([0.0 if r is None else r.black_level for r in radiometry], np.float32)
+    without_light -= np.divide(file.offsets, file.scales).astype(np.float32)
     is_sharpened = [is_in_range(band, pan) for band in bands]
     in_range = np.flatnonzero(is_sharpened)
 
     def read(tile: Tile) -> tuple[FloatImage, Mask]:
-        """((bands, height, width) without black level, nan for nodata; mask of valid pixels)."""
+        """((bands, height, width) above the number without light, nan for nodata; mask of valid pixels)."""
         pixels = file.read(window=Window(tile.x0, tile.y0, tile.width, tile.height)).astype(np.float32)
         valid = data_mask(pixels, nodata)
-        return np.where(valid, pixels - black_levels[:, None, None], np.float32(np.nan)), valid
+        return np.where(valid, pixels - without_light[:, None, None], np.float32(np.nan)), valid
 
     width, height = min(file.width, _TILE_PX), min(file.height, _TILE_PX)
     light, _ = read(Tile((file.width - width) // 2, (file.height - height) // 2, width, height))
@@ -154,14 +156,16 @@ def sharpened(
             light, valid = read(tile)
             ratio = brovey_ratio([*light[in_range]], light[count:].mean(axis=0), weights)
             for k in range(count):
-                values = (light[k] * ratio if is_sharpened[k] else light[k]) + black_levels[k]
+                values = (light[k] * ratio if is_sharpened[k] else light[k]) + without_light[k]
                 pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
                 yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
     source, texts = "the colour photograph" if pan[0].is_from_photograph else pan[0].name, ["no"] * count
     for k, weight in zip(in_range, weights.tolist(), strict=True):
         texts[k] = f"weighted Brovey by {source}, weight {weight:.4g}"
-    return [
-        LayerDescription(band.name, unit or "", file.tags(k) | {"PANSHARPENED": text}, file.tags(k, ns="IMAGERY"))
-        for k, (band, unit, text) in enumerate(zip(bands, file.units, texts, strict=False), start=1)
-    ], blocks()
+    result = []
+    for k, band in enumerate(bands):
+        tags, imagery = file.tags(k + 1) | {"PANSHARPENED": texts[k]}, file.tags(k + 1, ns="IMAGERY")
+        values = file.scales[k], file.offsets[k]
+        result.append(LayerDescription(band.name, file.units[k] or "", tags, imagery, values))
+    return result, blocks()

@@ -117,6 +117,23 @@ def test_gaps_keep_nodata_and_unseen_bands_are_not_sharpened(tmp_path: Path, nod
     assert (result[1, 20:] == 2000).all()
 
 
+def test_numbers_with_an_offset_are_sharpened_by_their_values(tmp_path: Path) -> None:
+    """The sharpened file has the scales and offsets of the bands."""
+    (green, red), pan = scene()
+    bands = [Band(name, tmp_path, 1, 320, 240, "uint16") for name in ("Green", "Red", "Panchro")]
+    planes, results, offset = np.stack([green, red, pan]), list[np.ndarray](), 1000
+    for number, offsets in ((0, (0.0,) * 3), (offset, (-0.1,) * 3)):
+        path = tmp_path / f"{number}.tif"
+        write_band(path, planes.astype(np.uint16) + np.uint16(number))
+        with rasterio.open(path, "r+") as file:
+            file.scales, file.offsets = (1e-4,) * 3, offsets
+        with open_raster(path) as file:
+            descriptions, blocks = sharpened(file, bands[:2], bands[2:], 2.0, is_raw=True)
+            results.append(np.stack([pixels for pixels, *_ in blocks]).astype(float))
+        assert [layer.scale_offset for layer in descriptions] == [(1e-4, offsets[0])] * 2
+    np.testing.assert_allclose(results[1] - offset, results[0], atol=1)
+
+
 @pytest.mark.parametrize(
     ("pan", "wavelength_nm", "status", "std_px", "sharpens"),
     [
