@@ -212,15 +212,20 @@ class CaptureEstimation:
         return self.decided()
 
     def _fit_windows(self, result: Alignments) -> Alignments:
-        """Fit windows alone where the descriptors have no result; return the alignments then."""
+        """Estimate bands by windows without descriptors where these have no result; return the alignments then."""
         lost = [self.bands[name] for name, a in result.items() if not a.is_usable(DELIVERED_STD_PX)]
         if not (lost and self._may_be_homography):
             return result
+        by_windows = {band.pair.name: refined for band in lost if (refined := fitted_to_windows(band)) is not None}
+        for name, refined in by_windows.items():
+            self.bands[name].refined = refined
+        for combined in self._combined() if by_windows else ():
+            if (name := combined.pair.name) in by_windows:
+                self.bands[name].candidates += combined.candidates("never")
         for band in lost:
-            by_windows = fitted_to_windows(band)
-            if by_windows is None or not by_windows.may_predict:
-                by_windows = in_windows_that_agree(band)
-            band.candidates += [] if by_windows is None else [by_windows]
+            if band.pair.name not in by_windows or not band.candidates[-1].may_predict:
+                of_coarse = in_windows_that_agree(band)
+                band.candidates += [] if of_coarse is None else [of_coarse]
         return self.decided()
 
     def _add_errors_of_relief(self, result: Alignments) -> Alignments:

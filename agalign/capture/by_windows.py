@@ -1,6 +1,6 @@
-"""Candidates that are fitted to windows, where descriptors do not suffice.
+"""Bands that are fitted to windows, where descriptors do not suffice.
 
-* Blurred, noisy or saturated images: the homography is fitted to windows.
+* Blurred, noisy or saturated images: the MAP estimate is by windows and the rig.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
   band. If nearly all of these agree with a trusted seed, they predict the mapping.
 * Images without common structure in one part: no residual contains the relief there, which a homography lacks.
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, without_descriptors
+from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand, mapping_error, without_descriptors
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.held_out import chessboard, one_by_one
-from agalign.fit.window_fit import cross_fitted
+from agalign.fit.held_out import one_by_one
+from agalign.fit.window_fit import cross_fitted, fit_in_rounds
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
@@ -32,32 +32,31 @@ _RELIEF_SHARE = 0.15
 altitude, plants and booms at a metre."""
 
 
-def fitted_to_windows(band: BandCandidates) -> Candidate | None:
-    """Return the candidate by windows alone; None if the descriptors of a sharp band have a result, if its seed does
-    not fit the windows, or if these determine none.
+def fitted_to_windows(band: BandCandidates) -> RefinedBand | None:
+    """Return a band with the windows under the homography that they determine, for a MAP estimate without descriptors;
+    None if the descriptors of a sharp band have a result, if its seed does not fit the windows, or if these determine
+    no homography.
     """
-    pair = band.pair
+    pair, start, known = band.pair, band.at_seed, band.joint
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
     descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in band.rejected)
-    start = band.at_seed
     if not descriptors_failed or start is None or not band.does_seed_fit:
         return None
-    max_moved_px = min(_MAX_MOVED_PX, pair.max_shift_px)
+    last = start
 
     def measured(mapping: PixelMapping) -> Residual:
-        return start.residual if mapping is start.mapping else WarpedPair.of(pair, mapping, start.windows).residual
+        nonlocal last
+        last = last if mapping is last.mapping else WarpedPair.of(pair, mapping, last.windows)
+        return last.residual
 
-    size_px, side_px = pair.fixed.size_px, start.windows.side
-    fitted = cross_fitted(start.mapping, measured, size_px, chessboard, side_px, max_moved_px=max_moved_px)
+    max_moved_px = min(_MAX_MOVED_PX, pair.max_shift_px)
+    fitted = fit_in_rounds(last.mapping, measured, pair.fixed.size_px, max_moved_px=max_moved_px)
     if fitted is None:
         return None
-    mapping, fit = fitted.mapping, fitted.fit
-    known = band.joint
     retrieval, chance = (0.0, 0.0) if known is None else (known.retrieval, known.chance)
-    joint = without_descriptors(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
-    joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
-    return Candidate.of(WarpedPair.of(pair, mapping, start.windows), joint, fitted.held_out)
+    joint = replace(without_descriptors(last.mapping.fixed_to_moving), retrieval=retrieval, chance=chance)
+    return RefinedBand(replace(joint, last_step_px=fitted[1].max_px), last)
 
 
 def in_windows_that_agree(band: BandCandidates) -> Candidate | None:

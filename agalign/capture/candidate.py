@@ -162,9 +162,9 @@ class RefinedBand:
     joint: JointResult
     """Without evidence of descriptors, at the seed, if the optimisation has no result."""
     warped: WarpedPair
-    by_fold: Sequence[Matrix] = ()
-    """The homographies without each fold of the windows, by the others, descriptors and rig; empty before the MAP
-    estimation.
+    by_fold: Sequence[Matrix | None] = ()
+    """The homographies without each fold of the windows, by the others, descriptors and rig, None where these determine
+    none; empty before the MAP estimation.
     """
 
     @classmethod

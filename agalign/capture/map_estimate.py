@@ -7,8 +7,9 @@ Three sources are combined:
     windows       s_i = D(x_i) delta_b + noise            residual shifts of the structure
     rig           delta_b = r_b + t(0, S_b)               its prediction from the capture's other bands
 
-Bands with little texture depend on the other bands and the rig. The residuals of the rig have a Student's t
-distribution, so a band that contradicts it by many standard deviations is not biased by it.
+Bands whose descriptors fail are estimated from the other two. Bands with little texture depend on the other bands and
+the rig. The residuals of the rig have a Student's t distribution, so a band that contradicts it by many standard
+deviations is not biased by it.
 """
 
 from collections.abc import Sequence
@@ -26,6 +27,7 @@ from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.capture import Capture
+from agalign.values.geometry import Matrix
 from agalign.values.least_squares import Robust, least_squares
 from agalign.values.residual import Residual
 
@@ -36,7 +38,7 @@ def with_map_estimates(
     """Return the bands of a `capture` with the MAP estimates of all windows, and with those without each fold of them.
 
     The windows of a band are ignored, also without a fold, if all together are too few or their correction is too
-    large. Bands without a covariance have their result.
+    large. Bands without any information have their result.
     """
     max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
     residuals = [band.warped.residual for band in bands]
@@ -50,15 +52,18 @@ def with_map_estimates(
         for some in (fits, *by_fold)
     )
     return [
-        replace(band, joint=joint, by_fold=[one.fixed_to_moving for one in others])
+        replace(band, joint=joint, by_fold=[_homography(one) for one in others])
         for band, joint, *others in zip(bands, estimates, *without, strict=True)
     ]
 
 
+def _homography(estimate: JointResult) -> Matrix | None:
+    """Return the homography; None if neither descriptors nor windows determine it."""
+    return None if estimate.corner_covariance_px2 is None else estimate.fixed_to_moving
+
+
 def _fit(band: RefinedBand, residual: Residual) -> WindowFit | None:
-    """Fit windows of a band, measured under its result; None if they determine nothing, or without a covariance."""
-    if band.joint.corner_covariance_px2 is None:
-        return None
+    """Fit windows of a band, measured under its result; None if they determine nothing."""
     return fit_windows(band.pair.mapping(band.joint.fixed_to_moving), residual, band.pair.fixed.size_px)
 
 
@@ -82,10 +87,10 @@ def _estimates(
 
 
 def _with_windows(pair: BandPair, result: JointResult, fit: WindowFit) -> JointResult:
-    """Combine the result of the descriptors with a fit to windows under it."""
-    assert result.corner_covariance_px2 is not None
-    information, of_windows = np.linalg.inv(result.corner_covariance_px2), np.linalg.inv(fit.covariance_px2)
-    covariance = np.linalg.inv(information + of_windows)
+    """Combine the result of the descriptors, if they have one, with a fit to windows under it."""
+    of_windows = np.linalg.inv(fit.covariance_px2)
+    known = result.corner_covariance_px2
+    covariance = fit.covariance_px2 if known is None else np.linalg.inv(np.linalg.inv(known) + of_windows)
     return _displaced(pair, result, covariance @ of_windows @ fit.corners_px, covariance)
 
 

@@ -76,11 +76,11 @@ class WarpedPair:
         own, others = (r.median_px / max(r.coverage, 1e-6) for r in (self.residual, compared.residual))
         return own < others
 
-    def cross_validated(self, by_fold: Sequence[Matrix]) -> "WarpedPair":
+    def cross_validated(self, by_fold: Sequence[Matrix | None]) -> "WarpedPair":
         """Return the pair with the residual of each window under the homography that was estimated without its fold of
-        a chessboard.
+        a chessboard; windows of a fold without one have no shift.
         """
-        mappings = [replace(self.mapping, fixed_to_moving=matrix) for matrix in by_fold]
+        mappings = [None if m is None else replace(self.mapping, fixed_to_moving=m) for m in by_fold]
         return replace(self, residual=held_out(self.residual, self.mapping, chessboard(self.residual), mappings))
 
     @cached_property

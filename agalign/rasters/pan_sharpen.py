@@ -164,8 +164,8 @@ def sharpened(
     for k, weight in zip(in_range, weights.tolist(), strict=True):
         texts[k] = f"weighted Brovey by {source}, weight {weight:.4g}"
     result = []
-    for k, band in enumerate(bands):
-        tags, imagery = file.tags(k + 1) | {"PANSHARPENED": texts[k]}, file.tags(k + 1, ns="IMAGERY")
-        values = file.scales[k], file.offsets[k]
-        result.append(LayerDescription(band.name, file.units[k] or "", tags, imagery, values))
+    for number, (band, unit, text) in enumerate(zip(bands, file.units, texts, strict=False), start=1):
+        tags, imagery = file.tags(number) | {"PANSHARPENED": text}, file.tags(number, ns="IMAGERY")
+        values = file.scales[number - 1], file.offsets[number - 1]
+        result.append(LayerDescription(band.name, unit or "", tags, imagery, values))
     return result, blocks()

@@ -79,7 +79,7 @@ class Seed:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class JointResult:
-    """Estimate from descriptors, windows, other bands and rig, or from windows alone.
+    """Estimate from descriptors, windows, other bands and rig; from the other three where descriptors fail.
 
     Examples
     --------
@@ -110,7 +110,7 @@ class JointResult:
     """Resolutions of the image pyramid; 1 is full."""
     recipe: str
     """`flight` (frozen network of the flight), `fast` or `scratch` (learned on this capture), `paper`, or `windows`
-    (windows alone)."""
+    (without descriptors)."""
     model_family: ModelFamily
     """Kind of mapping that was fitted to the descriptors; windows may make it a homography."""
     last_step_px: Number

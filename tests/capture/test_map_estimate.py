@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from agalign.capture import map_estimate
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_rig import observation
-from agalign.capture.candidate import RefinedBand
+from agalign.capture.candidate import RefinedBand, without_descriptors
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.held_out import chessboard
@@ -73,6 +73,19 @@ def test_the_prior_of_a_band_is_by_time_and_altitude_of_its_capture(monkeypatch:
     capture = Capture("one", Path(), (), 0)
     with_map_estimates([band(pairs()[0], result(0.0, 1.0))], rig(), capture)
     assert seen == [capture] * 3  # by all windows, and by each half
+
+
+def test_a_band_without_descriptors_is_estimated_from_windows_and_rig() -> None:
+    """Windows in the left half determine the mapping there and the rig elsewhere; without a rig, they do everywhere."""
+    red, nir = pairs()
+    left = residual_of(geometry.lattice(250, 480, 5, 6), np.array([0.3, 0.0]), sigma=30.0)
+    bands = [band(red, result(0, 0.03)), band(nir, without_descriptors(MEAN), left)]
+    (_, by_both), (_, by_windows) = (with_map_estimates(bands, the_rig) for the_rig in (rig(), None))
+    of_both, of_windows = (corners_near_the_mean(estimate.joint)[:, 0] for estimate in (by_both, by_windows))
+    np.testing.assert_allclose(of_windows, 0.3, atol=0.001)
+    assert of_both[[0, 3]] == pytest.approx(0.3, abs=0.02)
+    assert (of_both[1:3] < 0.15).all()
+    assert by_both.joint.corner_std_px < by_windows.joint.corner_std_px
 
 
 def test_corners_without_texture_follow_the_rig_with_its_error() -> None:
