@@ -31,14 +31,14 @@ RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
 PANELS_FILE, SKY_FILE, MODELS_FOLDER = "panels.json", "sky.json", "models"
 REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE = "index.html", "summary.csv", "indices.csv", "flight.geojson"
-PAGES = {
+PAGE_STARTS = {
     REPORT_FILE: b'<!doctype html>\n<html lang="en">\n<head>\n'
     b'<meta charset="utf-8">\n<meta name="generator" content="agalign">',
     SUMMARY_FILE: b"folder,capture,band,wavelength_nm,status,",
     INDICES_FILE: b"folder,capture,captured_at,latitude,longitude,index,",
     FLIGHT_MAP_FILE: b'{"type": "FeatureCollection", "name": "flight", ',
 }
-"""Pages and tables of a run in its output folder, and how each starts."""
+"""How the pages and tables of a run start, by their names in the output folder: the mark of this program."""
 _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
 _MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from agalign.errors import ConfigurationError
-from agalign.host.files import PAGES, open_regular
+from agalign.host.files import PAGE_STARTS, open_regular
 
 SOFTWARE = "agalign"
 """Value of the tag Software of every raster."""
@@ -63,7 +63,7 @@ def refuse_foreign(path: Path, text_starts: tuple[bytes, ...] = (), folder: str 
 
 def refuse_foreign_pages(out: Path) -> None:
     """Raise ConfigurationError for a file with the name of a page or table of a run that no command has written."""
-    for name, start in PAGES.items():
+    for name, start in PAGE_STARTS.items():
         refuse_foreign(out / name, (start,))
 
 

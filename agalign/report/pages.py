@@ -32,7 +32,7 @@ from agalign.report.facts import FlightFacts
 from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
 from agalign.report.pair_totals import PairTotals
-from agalign.report.terms import PAGES, TERMS
+from agalign.report.terms import DOC_PAGES, TERMS
 from agalign.spectral_indices.indices_csv import current_rows, merged, reports_of, update_table
 from agalign.spectral_indices.rasters import IndexReport
 
@@ -195,7 +195,7 @@ def _page(**values: Any) -> str:
         "median": median,
         "counted": counted,
         "terms": TERMS,
-        "pages": PAGES,
+        "pages": DOC_PAGES,
         "max_listed": _MAX_LISTED,
         "max_excluded": _MAX_EXCLUDED,
     }

@@ -88,7 +88,7 @@ TERMS: dict[str, Term] = {
         "error from flight", "RMS error of the band if only the other captures predict it, px of the band"
     ),
 }
-PAGES = (
+DOC_PAGES = (
     ("Read the report", "docs/how-to/report.md", "what to do, and limits for use"),
     (
         "How results are verified, and the limits",

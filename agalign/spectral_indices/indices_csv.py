@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from agalign.errors import InputError
-from agalign.host.files import INDICES_FILE, PAGES, read_regular, write_csv
+from agalign.host.files import INDICES_FILE, PAGE_STARTS, read_regular, write_csv
 from agalign.host.own_files import refuse_foreign
 from agalign.host.text import without_formula
 from agalign.records.cautions import RunFacts
@@ -67,7 +67,7 @@ def read_table(out: Path) -> list[IndexReport]:
 
 def refuse_foreign_table(folder: Path) -> None:
     """Raise ConfigurationError if a folder has a file with the name of the table that no command has written."""
-    refuse_foreign(folder / INDICES_FILE, (PAGES[INDICES_FILE],), "folder")
+    refuse_foreign(folder / INDICES_FILE, (PAGE_STARTS[INDICES_FILE],), "folder")
 
 
 def current_rows(out: Path) -> list[IndexReport]:

@@ -28,7 +28,7 @@ from agalign.report.charts import CHART_HEIGHT, drifts_of, hues_of, rig_views
 from agalign.report.facts import CameraOffsets
 from agalign.report.pages import pages_exist, write_pages
 from agalign.report.pair_totals import PairTotals
-from agalign.report.terms import PAGES, TERMS
+from agalign.report.terms import DOC_PAGES, TERMS
 from agalign.spectral_indices.indices_csv import update_table
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import Band, Capture
@@ -275,7 +275,7 @@ def test_each_term_of_a_column_is_explained_in_the_help(out: Path) -> None:
     assert len(used) >= 8
     for name in TERMS:
         assert f'<dd id="term-{name}">' in page
-    for _, file, _ in PAGES:
+    for _, file, _ in DOC_PAGES:
         assert (Path(agalign.__file__).parents[1] / file).is_file()
         assert file in page
 
