@@ -32,8 +32,9 @@ from agalign.host.processes import (
     worker_context,
 )
 
-_MAX_DEATHS = 3
-"""Maximum number of workers that end in a row without a finished task between them; then no more are started."""
+_MAX_DEATHS = 8
+"""Number of workers that end in a row without a finished task between them, from which no more are started: the machine
+lacks memory. Some neighbouring captures that no worker survives, such as damaged ones, cost only themselves."""
 _MAX_TRIES = 2
 """A signal may kill a worker for reasons other than its task, such as a lack of memory."""
 _MAX_TASKS_PER_WORKER = 500

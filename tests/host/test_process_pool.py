@@ -254,9 +254,17 @@ def test_workers_killed_together_do_not_end_the_run() -> None:
 def test_workers_that_end_one_after_another_fail_all_tasks(tmp_path: Path) -> None:
     function, argument = ended_while("computing", signal.SIGKILL, 99, tmp_path)
     with pool() as workers:
-        errors = outcomes(workers, function, [argument] * 4)
-    said = "3 worker processes one after another ended before they finished anything (the last by signal 9"
+        errors = outcomes(workers, function, [argument] * 9)
+    said = "8 worker processes one after another ended before they finished anything (the last by signal 9"
     assert all(said in error for error in errors)
+
+
+def test_three_tasks_in_a_row_that_no_worker_survives_cost_only_themselves(tmp_path: Path) -> None:
+    deadly = [(tmp_path / str(number), signal.SIGKILL, 2) for number in range(3)]
+    harmless = (tmp_path / "none", signal.SIGKILL, 0)
+    with pool() as workers:
+        results = outcomes(workers, tasks.signalled, [*deadly, harmless])
+    assert results == ["WorkerDiedError: signal 9"] * 3 + [None]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no fork server here")
