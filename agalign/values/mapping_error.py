@@ -224,9 +224,8 @@ class MappingError:
         """Return u^2 (n,): the expected squared shift at points that the mapping does not contain.
 
         It is the median of the nearest windows, by distance and noise, minus their noise, so that a single wrong peak
-        does not count. Where
-        one window has more weight than the others together, the value of all windows has the weight that they lack. It
-        is shrunk towards the value of all windows, which is used alone far from them.
+        does not count. Where one window has more weight than the others together, the value of all windows has the
+        weight that they lack. It is shrunk towards the value of all windows, which is used alone far from them.
         """
         measured = self._measured
         if measured is None:
