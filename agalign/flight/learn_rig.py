@@ -1,5 +1,6 @@
 """Estimation of a flight's rig from the mappings of some captures, with cross-validated errors."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -48,7 +49,7 @@ def learn_rig(
     fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors)
     offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), zip(bands, fitted[:, 6:8].tolist(), strict=True)
     by_capture = zip(captures, nu_w.tolist(), strict=True)
-    squares_px2 = {b: [c.parallax_px.get(b, 0.0) ** 2 for c in captures if b in c.mappings] for b in bands}
+    lengths = {b: math.hypot(x, y) for b, (x, y) in zip(bands, fitted[:, 6:8].tolist(), strict=True)}
     return Rig(
         size_px=size_px,
         mean={b: rig.displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
@@ -58,8 +59,26 @@ def learn_rig(
         factors=factors,
         captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
         from_bands_px=dict(zip(bands, errors_px.tolist(), strict=True)),
-        parallax_px={b: float(np.sqrt(np.mean(squares))) for b, squares in squares_px2.items()},
+        parallax_px=_parallax_px(captures, lengths),
     )
+
+
+def _parallax_px(captures: Sequence[Observation], lengths: Mapping[str, float]) -> dict[str, float]:
+    """Return the RMS displacement of each band by the reliefs of the captures, px of the reference, given the lengths
+    of the bands' baselines.
+
+    A band without a relief in a capture that has one, such as a thermal band, gets that of the other bands, as the
+    displacement is proportional to the baseline.
+    """
+    squares_px2: dict[str, list[float]] = {band: [] for band in lengths}
+    for capture in captures:
+        known = [(lengths[b], px) for b, px in capture.parallax_px.items() if b in lengths]
+        square = sum(length**2 for length, _ in known)
+        per_length_px = sum(length * px for length, px in known) / square if square > 0 else 0.0
+        for band, length in lengths.items():
+            if band in capture.mappings:
+                squares_px2[band].append(capture.parallax_px.get(band, per_length_px * length) ** 2)
+    return {band: float(np.sqrt(np.mean(squares))) for band, squares in squares_px2.items()}
 
 
 class _Table:

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -115,7 +116,18 @@ def test_the_parallax_of_a_flight_is_the_rms_over_its_captures() -> None:
     captures = flight(4)
     captures[0] = replace(captures[0], parallax_px={"Red": 6.0})
     learned = learn_rig(captures, SIZE, {})
-    assert learned.parallax_px == pytest.approx({**dict.fromkeys(learned.mean, 0.0), "Red": 3.0})
+    assert learned.parallax_px["Red"] == pytest.approx(3.0)
+
+
+def test_a_band_without_a_relief_has_the_parallax_of_the_others_by_its_baseline() -> None:
+    """A thermal band is aligned without the relief of the others, and moves by it all the same."""
+    captures = flight(4)
+    captures[0] = replace(captures[0], parallax_px={"Red": 6.0})
+    learned = learn_rig(captures, SIZE, {})
+    lengths = {band: math.hypot(*learned.baselines[band]) for band in learned.mean}
+    assert lengths["NIR"] > 0
+    assert learned.parallax_px["NIR"] == pytest.approx(3.0 * lengths["NIR"] / lengths["Red"])
+    assert learn_rig(flight(4), SIZE, {}).parallax_px == dict.fromkeys(learned.mean, 0.0)
 
 
 @pytest.mark.slow
