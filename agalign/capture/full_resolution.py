@@ -83,8 +83,7 @@ def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue |
     factors = np.tile(scale, 4)
     joint = start.joint.with_homography(down.fixed_to_moving, fitted.fit.covariance_px2 * np.outer(factors, factors))
     held_out = fitted.held_out.rescaled(scale)
-    # The field is not fitted here, and its windows are those of the reduced images: it continues by chance nowhere.
-    error = mapping_error(pair, down, joint.covariance_px2, held_out, down.field)
+    error = mapping_error(pair, down, joint.covariance_px2, held_out)
     refined = Candidate(pair, down, error, held_out, joint, refined_from=start)
     return refined.with_relief_std_px(start.error.relief_std_px)
 
