@@ -133,8 +133,8 @@ class JointResult:
 
     @property
     def is_retrieved(self) -> bool:
-        """True if the descriptors distinguish held-out patches."""
-        return self.retrieval >= self.min_retrieval
+        """True if the mapping is by descriptors that distinguish held-out patches."""
+        return self.recipe != BY_WINDOWS and self.retrieval >= self.min_retrieval
 
     @property
     def covariance_px2(self) -> NDArray[np.float64]:

@@ -160,6 +160,12 @@ def test_without_descriptors_more_windows_are_required(recipe: str, residual: Re
     assert codes(replace(GOOD, joint=joint, windows=residual)) == ([] if is_accepted else ["retrieval"])
 
 
+def test_descriptors_do_not_confirm_a_mapping_that_is_fitted_to_windows() -> None:
+    """Their retrieval was measured under another mapping."""
+    joint = joint_result(retrieval=0.9, recipe="windows")
+    assert codes(replace(GOOD, joint=joint, windows=shifted(0, 0.0, 11))) == ["retrieval"]
+
+
 @pytest.mark.parametrize(
     ("off_px", "std_px", "is_issue"),
     [(None, 0.2, False), (2.9, 0.2, False), (3.1, 0.2, True), (4.9, 1.0, False), (5.1, 1.0, True), (NAN, 0.2, True)],
