@@ -59,9 +59,14 @@ def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, i
 
 
 def shift_variance_px2(scale_px: float | Array, *, with_shapes: bool = False) -> Any:
-    """Return the variance along an axis of shifts with residuals of this scale, to which `with_shapes` lens shapes are
-    fitted.
+    """Return the variance along an axis of shifts with residuals of this robust scale, `least_squares.shift_scale_px`,
+    to which `with_shapes` lens shapes are fitted.
     """
     axis_share = 1 / 3  # of the squared scale of lengths; normally distributed: 1 / 3.05
-    factor = _VARIANCE_FACTOR if with_shapes else 1.0
-    return factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2
+    variance_px2 = axis_share * scale_px**2
+    return variance_of_shapes_px2(variance_px2) if with_shapes else variance_px2 + MIN_SHIFT_SCALE_PX**2
+
+
+def variance_of_shapes_px2(axis_variance_px2: float | Array) -> Any:
+    """Return the variance along an axis that shifts have for lens shapes, from that of their residuals."""
+    return _VARIANCE_FACTOR * axis_variance_px2 + MIN_SHIFT_SCALE_PX**2

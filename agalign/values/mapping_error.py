@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from agalign.values import geometry
 from agalign.values.geometry import PairScales, Points
 from agalign.values.image import FloatImage, Tile
-from agalign.values.lens_shapes import lens_shapes, shift_variance_px2, variance_px2
+from agalign.values.lens_shapes import lens_shapes, variance_of_shapes_px2, variance_px2
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
@@ -67,7 +67,8 @@ class MappingError:
     """C: covariance of the corners (8, 8), clockwise from the top left, x and y in turn, or with the lens shapes
     (12, 12); None for a prediction by other bands or captures."""
     residual: Residual | None = None
-    """Shifts of windows that the fit did not use, under the mapping; None if they say nothing about it."""
+    """Shifts of windows that the fit did not use, under the mapping, or under that without its displacement field on a
+    relief; None if they say nothing about it."""
     rig_std_px: float = 0.0
     """Standard error of a prediction by other bands or captures, the same everywhere."""
     lens_std_px: NDArray[np.float64] | None = None
@@ -212,7 +213,7 @@ class MappingError:
         remaining = flat_lenses - flat_corners @ followed
         # By the shifts beyond their noise: with all of the shift, bands with noise or saturation claim up to twice as
         # much, although seven tenths of the errors are within the claims without it.
-        information = remaining.T @ remaining / shift_variance_px2(self._measured.std_px, with_shapes=True)
+        information = remaining.T @ remaining / variance_of_shapes_px2(self._measured.std_px**2 / 2)
         of_lenses = np.linalg.inv(np.diag(self.lens_std_px**-2.0) + information)
         result = np.zeros((12, 12))
         result[:8, :8] = self.covariance_px2[:8, :8] + followed @ of_lenses @ followed.T

@@ -10,7 +10,8 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.geometry import PairScales
 from agalign.values.image import Tile
-from agalign.values.lens_shapes import lens_std_px
+from agalign.values.least_squares import shift_scale_px
+from agalign.values.lens_shapes import lens_shapes, lens_std_px, shift_variance_px2
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.moved_area import MovedArea
 from agalign.values.parallax import Parallax, Relief
@@ -227,3 +228,20 @@ def test_windows_of_several_captures_have_the_weights_of_one() -> None:
     three = Residual.joined([one] * 3)
     assert three.spacing_px == one.spacing_px > 100
     assert three.std_px == pytest.approx(one.std_px)
+
+
+def test_lens_shapes_have_the_variance_of_shifts_whether_by_their_rms_or_by_their_robust_scale() -> None:
+    """Of normally distributed shifts, both are the standard deviation of a coordinate."""
+    shifts_px = np.random.default_rng(0).normal(0.0, 0.3, (400, 2))
+    residual = residual_of(geometry.lattice(640, 480, 20, 20), shifts_px, sigma=1000.0)
+    by_scale_px2 = shift_variance_px2(shift_scale_px(residual.lengths_px), with_shapes=True)
+    covariance = 1e-6 * np.eye(8)
+    error = MappingError((640, 480), covariance, residual, lens_std_px=np.full(4, 100.0))
+    scaled = replace(error, residual=residual.with_shifts(2 * shifts_px))
+    ratios = np.diag(scaled._with_lenses)[8:] / np.diag(error._with_lenses)[8:]
+    np.testing.assert_allclose(ratios, 4.0, rtol=0.01)
+    design = lens_shapes(residual.centres_px, error.size_px).reshape(-1, 4)
+    corners = geometry.over_corners(residual.centres_px, *error.size_px).reshape(-1, 8)
+    free = design - corners @ np.linalg.lstsq(corners, design, rcond=None)[0]
+    expected_px2 = by_scale_px2 * np.diag(np.linalg.inv(free.T @ free))
+    np.testing.assert_allclose(np.diag(error._with_lenses)[8:], expected_px2, rtol=0.1)
