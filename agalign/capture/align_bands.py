@@ -8,12 +8,13 @@ from functools import partial
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import UnderRelief, by_relief
 from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, rig_predictions
-from agalign.capture.by_windows import fitted_to_windows, in_windows_that_agree, is_extrapolated, spreads_of_relief_px
+from agalign.capture.by_windows import fitted_to_windows, in_windows_that_agree
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution, is_worth_refining
 from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.metrics import with_metrics
+from agalign.capture.missing_relief import is_extrapolated, spreads_of_relief_px
 from agalign.capture.seeding import corrected, find_seed, image_groups
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel

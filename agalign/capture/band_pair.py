@@ -80,7 +80,9 @@ class BandPair:
 
     @property
     def max_shift_px(self) -> float:
-        """Maximum distance of a result from its seed; infinite unless the user specified the seed."""
+        """Maximum distance of what a search or a fit to windows finds from its seed; infinite unless the user gave
+        the seed. In repetitive scenes, it is that of every result.
+        """
         return self.seed_std_px.get("user", math.inf) * _MAX_ERROR_STD
 
     @property

@@ -3,8 +3,8 @@
 It is estimated if the residuals of the homographies have parallax in common. A relief that was estimated without a
 band verifies the band, in windows that took no part in the fit of planes and baselines: with few bands the relief of
 all others, else that of half of the bands. A band that the relief of the others does not explain, as it was exposed at
-another time or is noisy, gets a homography and a baseline of its own under that relief. Either all bands with the same
-reference image use the relief, or none: bands of much lower resolution have another one.
+another time or is noisy, gets a homography and a baseline of its own under that relief. If a relief is used, a band
+with the same reference image that does not follow it is `predicted`; bands of much lower resolution have another one.
 """
 
 import math

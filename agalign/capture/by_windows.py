@@ -3,33 +3,24 @@
 * Blurred, noisy or saturated images: the MAP estimate is by windows and the rig.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
   band. If nearly all of these agree with a trusted seed, they predict the mapping.
-* Images without common structure in one part: no residual contains the relief there, which a homography lacks.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand, mapping_error, without_descriptors
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.held_out import one_by_one
 from agalign.fit.window_fit import cross_fitted, fit_in_rounds
-from agalign.values import geometry
-from agalign.values.geometry import Matrix
-from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
 from agalign.verify.checks import MAX_ALIAS_PEAK
-from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
 _MAX_MOVED_PX = 16.0
 """Maximum distance of a corner from that of the seed; larger ones contradict it."""
-_RELIEF_SHARE = 0.15
-"""Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
-altitude, plants and booms at a metre."""
 
 
 def fitted_to_windows(band: BandCandidates) -> RefinedBand | None:
@@ -95,40 +86,3 @@ def _are_consistent(residuals_px: NDArray[np.float64]) -> bool:
     max_close_px, min_close_share = 3.0, 0.85
     count = len(residuals_px)
     return count >= min_windows and bool((residuals_px <= max_close_px).sum() >= min_close_share * count)
-
-
-def is_extrapolated(candidate: Candidate) -> bool:
-    """Return True for a mapping that is only inaccurate, without windows in a quarter of the image."""
-    pair = candidate.pair
-    if [issue.kind for issue in candidate.issues] != [INACCURATE]:
-        return False
-    in_frame_px = points_in_frame(candidate.mapping, *pair.sizes_px)
-    unobserved = unobserved_quarters(candidate.residual.measured_px, pair.fixed.size_px, in_frame_px)
-    return not pair.is_georeferenced and bool(unobserved)
-
-
-def spreads_of_relief_px(pairs: Sequence[BandPair], homographies: Mapping[str, Matrix]) -> dict[str, float]:
-    """Return the spread of the relief that the homographies between the images lack, by band, px of the fixed image.
-
-    It is that of the flight, or that of unknown relief at the range of the capture, if this is larger. The rig tags
-    contain the mappings at infinity. Their errors have no common direction: the shift of the scene from infinity is the
-    part of the bands' differences from the tags that is proportional to the layout of the lenses.
-    """
-    layouts, offsets_px = dict[str, np.ndarray](), []
-    for pair in pairs:
-        if pair.layout is None or "rig" not in pair.seed_matrices or pair.name not in homographies:
-            continue
-        centre = (np.array(pair.fixed.size_px) - 1) / 2
-        from_infinity = geometry.compose(geometry.invert(pair.seed_matrices["rig"]), homographies[pair.name])
-        layouts[pair.name] = np.array(pair.layout)
-        offsets_px.append((geometry.apply(from_infinity, centre) - centre) / pair.scales.fixed.mean)
-    along, known = np.ravel(offsets_px), np.ravel(list(layouts.values()))
-    common_px = max(0.0, float(along @ known)) / max(float(known @ known), 1e-12)
-
-    def spread_px(pair: BandPair) -> float:
-        if pair.name not in layouts:
-            return pair.relief_std_px
-        shift_px = common_px * float(np.linalg.norm(layouts[pair.name])) * pair.scales.fixed.mean
-        return max(pair.relief_std_px, _RELIEF_SHARE * shift_px)
-
-    return {pair.name: spread_px(pair) for pair in pairs}

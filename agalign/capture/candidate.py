@@ -33,7 +33,8 @@ class Candidate:
     error: MappingError
     residual: Residual
     """Windows without their own part in the fit, by the rule of `fit.held_out`; descriptors and rig contribute to each
-    fit of a homography. Under a relief, windows in other fields than those of the fit.
+    fit of a homography, and the homography below a displacement field is fitted to all windows. Under a relief, windows
+    in other fields than those of the fit, without the displacement field.
     """
     joint: JointResult | None = None
     """Evidence of descriptors or windows; None for a prediction by the rig."""
@@ -201,9 +202,10 @@ class RefinedBand:
 
     @property
     def _unchanged_if_aligned(self) -> "RefinedBand":
-        """The band with the mapping given by the files, if its own does not differ significantly.
+        """The band with the mapping given by the files, if its own differs by little.
 
-        Input that is aligned already is returned unchanged instead of resampled by a small shift.
+        Input that is aligned already is returned unchanged instead of resampled by a small shift, which its windows
+        and thereby its expected error contain.
         """
         pair, joint = self.pair, self.joint
         kinds: tuple[SeedKind, ...] = ("geo", "identity")

@@ -239,7 +239,8 @@ def seed_fits(residual: Residual) -> bool:
 
 
 def is_unchanged(joint: JointResult, given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:
-    """Return True if a result on an image (width, height) does not differ from the mapping `given` by the files.
+    """Return True if a result on an image (width, height) is so near the mapping `given` by the files that resampling
+    would cost more than it gains.
 
     `scale` is the size of the image relative to its file.
     """
