@@ -132,7 +132,8 @@ class DiscoverOptions:
 
 @validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
 class RunOptions:
-    """How to run. Only `align_panels` changes results: with it, calibration panels give no reflectance.
+    """How to run. Two fields change results: with `align_panels`, calibration panels give no reflectance, and captures
+    that take longer than `timeout_s` teach nothing and have none.
 
     In Python, `executor` is a concurrent.futures executor, such as that of `dask_executor`, instead of an address.
 

@@ -11,7 +11,7 @@ import cv2
 from agalign.batch.capture_task import quiet
 from agalign.batch.workers import failure_text, numbers_of_workers, open_workers, serially
 from agalign.errors import AgalignError, ConfigurationError, SidecarError
-from agalign.host.files import REPORT_FILE, written_below
+from agalign.host.files import REPORT_FILE, RUN_FILE, written_below
 from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.processes import cores_for
 from agalign.records.captures import bands_of
@@ -56,13 +56,16 @@ def index_tasks(
     out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run, and ConfigurationError
-    without indices, or if the target has a table or page that no command has written, or an index of another flight.
+    without indices, or if the target is that of another run, or has a table or page that no command has written, or an
+    index of another flight.
     """
     if not indices:
         raise ConfigurationError("no index is given; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
     if target.resolve() == out.resolve():
         target = out  # also if it is spelled differently, or is a link
         refuse_foreign_pages(out)
+    elif (target / RUN_FILE).is_file():
+        raise ConfigurationError(f"{target}: is the output folder of another run; choose another folder with -o")
     else:
         refuse_foreign_table(target)
     sidecars = counted_sidecars(run_sidecars(out), out)
@@ -80,9 +83,9 @@ def _refuse_indices_of_others(tasks: Sequence[IndexTask]) -> None:
     for task in tasks:
         for raster in index_rasters(task.target / task.label):
             with suppress(SidecarError):  # reported when its task is done
-                places = (band.place for band in read_sidecar(task.sidecar).bands if band.place is not None)
-                files = {task.sidecar.parent / place.file for place in places}
-                if any(map(raster.is_of_other, files)):
+                sidecar = read_sidecar(task.sidecar)
+                files = {task.sidecar.parent / band.place.file for band in sidecar.bands if band.place is not None}
+                if any(raster.is_of_other(file, sidecar.input_samples.values()) for file in files):
                     raise ConfigurationError(f"{raster.path}: is of another flight; choose another folder with -o")
 
 
@@ -95,8 +98,8 @@ def run_indices(
     """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv, and the
     pages of the run if they are in the same folder. Files that are not in the pages are reported to `on_problem`.
 
-    `jobs` is the number of processes, each for one capture at a time; 0 is one per core. An `executor` processes the
-    captures instead; its workers need the same folders.
+    `jobs` is the maximum number of processes, each for one capture at a time; 0 is one per core. An `executor`
+    processes the captures instead; its workers need the same folders.
     A failed capture is reported and does not stop the others. Raises WorkerError if no worker process can be started,
     and OutputError if the table or the pages cannot be written.
     """
@@ -129,7 +132,10 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
             files = ListedFiles.of(sidecar, task.sidecar.parent, task.file_states)
-            written = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite, listed=files)
+            samples = sidecar.input_samples.values()
+            written = write_rasters(
+                bands, task.indices, base, task.label, overwrite=task.overwrite, listed=files, samples=samples
+            )
             reports = [*written]
             if task.target == task.out:
                 listed = {part.file for part in sidecar.products}

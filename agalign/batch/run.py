@@ -180,7 +180,7 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     try:
         yield record
     except BaseException:
-        with suppress(OutputError):
+        with suppress(AgalignError):
             run.end(record, "interrupted", time.monotonic() - began, earlier)
         raise
     run.end(record, "finished", time.monotonic() - began, earlier)

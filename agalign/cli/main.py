@@ -113,7 +113,7 @@ app.callback(invoke_without_command=True, help=help_of(_root)[0])(_root)
 def main() -> None:
     """Run the application; if the first argument is not a command, it is the folder to align."""
     arguments = sys.argv[1:]
-    root_options = ("--help", "-h", "--version", "--install-completion", "--show-completion")
+    root_options = ("--help", "--version", "--install-completion", "--show-completion")
     problem = next(filter(None, map(name_problem, arguments)), "")
     if arguments and arguments[0] not in {*COMMANDS, *root_options}:
         problem = problem or _problem_of_folder(arguments)

@@ -33,8 +33,8 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     path
         Sidecar (<capture>.json) or stack (<capture>.tif) of the capture.
     masked
-        Return float32 with NaN for nodata. False: the type of the file, with its nodata value as `_FillValue`;
-        differences of unsigned integers then wrap around.
+        Return float32 with NaN for nodata, and values by the scale and offset of the file. False: the type of the file,
+        with its `_FillValue`, `scale_factor` and `add_offset`; differences of unsigned integers then wrap around.
 
     Returns
     -------
@@ -199,11 +199,12 @@ def _opened(path: Path, listed: ListedFiles, *, masked: bool) -> Any:
     if problem := listed.problem(path):
         raise UnreadableFileError(problem)
     try:
-        with without_warnings():
+        with without_warnings(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "(Scales|Offsets) differ across bands")  # each variable has its own
             # Some of GDAL's other drivers open files or addresses that the contents of a file name.
             # Chunks of four blocks of the stacks along each axis: dask reads 2 MB of 16 bits at a time.
             chunks = {"x": 1024, "y": 1024}
-            return rioxarray.open_rasterio(gdal_name(path), chunks=chunks, masked=masked, driver="GTiff")
+            return rioxarray.open_rasterio(gdal_name(path), chunks=chunks, mask_and_scale=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error})", "run again") from None
 
@@ -214,10 +215,10 @@ def _variable(file: "xarray.DataArray", band: BandResult, index: int, name: str,
     one = file.isel(band=index - 1, drop=True)
     if masked:
         one = one.astype(np.float32)  # rioxarray keeps integers without a nodata value
-    units = file.attrs.get("units")
-    unit = units[index - 1] if isinstance(units, tuple) else units
-    encoding = {k: v for k, v in file.attrs.items() if k in ("_FillValue", "scale_factor", "add_offset")}
-    one.attrs = encoding | {"long_name": band.band, "units": unit or "count", "status": band.status}
+    attrs = {k: v[index - 1] if isinstance(v, tuple) else v for k, v in file.attrs.items()}
+    names = {"_FillValue": "_FillValue", "scales": "scale_factor", "offsets": "add_offset"}
+    encoding = {new: attrs[k] for old, new in names.items() for k in (old, new) if k in attrs}
+    one.attrs = encoding | {"long_name": band.band, "units": attrs.get("units") or "count", "status": band.status}
     if band.wavelength_nm is not None:
         one.attrs["wavelength_nm"] = band.wavelength_nm
     return one

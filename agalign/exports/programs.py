@@ -10,7 +10,15 @@ from agalign.cameras import pix4d
 from agalign.cameras.image_file import natural_order
 from agalign.cameras.metadata import read_tags
 from agalign.errors import ConfigurationError, InputError, OutputError
-from agalign.host.files import check_inside, file_name, link_or_copy, remove_partial_files, scratch_file, write_text
+from agalign.host.files import (
+    check_inside,
+    file_name,
+    link_or_copy,
+    path_problem,
+    remove_partial_files,
+    scratch_file,
+    write_text,
+)
 from agalign.host.text import counted
 from agalign.rasters.aligned_files import BandFiles
 from agalign.rasters.band_reader import like_most
@@ -22,7 +30,7 @@ _NOTES: dict[ExportProgram, str] = {
 OpenDroneMap, WebODM: the bands of each capture are aligned, and have the tags of one camera.
   --skip-band-alignment --primary-band '{reference}' --radiometric-calibration {calibration}\
  --texturing-skip-global-seam-leveling
-{reference} is the reference band, which is not resampled.
+{reference} is the reference band.
 The files contain {contents}""",
     "metashape": """\
 Agisoft Metashape: Workflow, Add Folder, 'Multi-camera system'.
@@ -65,8 +73,10 @@ def export(out: Path, target: Path, program: ExportProgram, *, copy: bool = Fals
     The captures have the same bands and quantities as most. Files are hard links if the file system allows that, and
     copies otherwise or with `copy`.
     Raises InputError if there is no run or nothing to export, ConfigurationError if the run wrote no band files,
-    OutputError if `target` is not empty or cannot be written.
+    OutputError if `target` is not empty, cannot be written, or is no local folder.
     """
+    if problem := path_problem(target):
+        raise OutputError(problem)
     captures, left_out = captures_of_run(out)
     good = [c for c in captures if c.result.status == "ok"]
     # A misaligned band harms a reconstruction more than a missing capture.

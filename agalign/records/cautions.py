@@ -136,7 +136,7 @@ class RunFacts:
             if output.without_reflectance and band_part.quantity != "temperature":
                 reason = f"not written as reflectance: {output.without_reflectance}"
                 yield Caution(band_part.band, _WITHOUT_REFLECTANCE, reason, 1.0, is_unusable=True)
-        scales = self._sensor_scales(sidecar.captured_at)
+        scales = self._sensor_scales(sidecar)
         age_s = output.panel_age_s or 0.0
         choice = sidecar.write_options.get("radiometry", "auto")
         remedy = remedies.CONTRADICTING_LIGHT.get(choice, remedies.CONTRADICTING_LIGHT["auto"])
@@ -155,10 +155,12 @@ class RunFacts:
                 reason = f"the nearest panel is {age_s / 60:.0f} min away"
                 yield Caution(band, remedies.OLD_PANEL, reason, lost, age_s, f"up to {age_s / 60:.0f} min")
 
-    def _sensor_scales(self, captured_at: str) -> dict[str, float]:
-        """Irradiance on contradicting panels divided by that of the sensor, by band; the largest difference counts."""
-        time, scales = CaptureTime.of(captured_at), dict[str, float]()
-        for panel in self.panels:
+    def _sensor_scales(self, sidecar: Sidecar) -> dict[str, float]:
+        """Irradiance on contradicting panels of the camera divided by that of the sensor, by band; the largest
+        difference counts.
+        """
+        time, scales = CaptureTime.of(sidecar.captured_at), dict[str, float]()
+        for panel in (panel for panel in self.panels if panel.camera == sidecar.camera):
             panel_time = CaptureTime.of(panel.captured_at)
             # A panel without a time is of the flight.
             apart_s = abs((time.utc - panel_time.utc).total_seconds()) if time and panel_time else 0.0

@@ -156,7 +156,11 @@ def label_of(sidecar: Path, out: Path) -> str:
 
 
 def run_sidecars(out: Path) -> list[Path]:
-    """Return the sidecars below the output folder of a run. Raises InputError if there are none."""
+    """Return the sidecars below the output folder of a run. Raises InputError if there are none, or if the folder
+    contains output folders of runs and is none itself.
+    """
+    if not (out / RUN_FILE).is_file() and (inner := next(out.rglob(RUN_FILE), None)) is not None:
+        raise InputError(f"{out}: contains runs, such as {inner.parent}, and is none itself; give the folder of one")
     sidecars = find_sidecars(out) if out.is_dir() else []
     if not sidecars and (out / RUN_FILE).is_file():
         raise InputError(f"{out}: the run there has no results: it was stopped, or all captures failed; run it again")

@@ -5,7 +5,7 @@
 import glob
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -44,6 +44,7 @@ from agalign.values.spectrum import role_of_band
 PICTURE_PX = 720
 """Longer side of the image at the top left of a picture, which the report overlays on the composite."""
 _OF_CAPTURE = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME"
+_SAMPLES_TAG = "INPUT_SAMPLES"
 """Tags of a raster that tell of which capture it is."""
 _STATISTICS_TAG = "INDEX_STATISTICS"
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
@@ -181,6 +182,7 @@ class IndexRasters(Product):
         Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
         """
         base, label = context.paths.file(""), context.capture.label
+        samples = context.sidecar.input_samples.values()
         requested, rasters = chosen_indices(context.settings.write.indices), index_rasters(base)
         earlier = [raster for raster in rasters if raster.name not in {one.name for one in requested}]
         if not (requested or earlier):
@@ -189,7 +191,9 @@ class IndexRasters(Product):
         masked = list(_masked(bands, context))
         stay_masked = {raster.name for raster in rasters if raster.is_masked and any(b.quality for b in masked)}
         for index in requested:
-            (report,) = write_rasters(masked if index.name in stay_masked else bands, [index], base, label)
+            (report,) = write_rasters(
+                masked if index.name in stay_masked else bands, [index], base, label, samples=samples
+            )
             if report.path is not None:
                 yield from self._files(context, index, report)
             elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
@@ -198,7 +202,9 @@ class IndexRasters(Product):
             if raster.index is None:
                 yield LostFile(raster.path, "its formula is unknown")
                 continue
-            (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
+            (report,) = write_rasters(
+                masked if raster.is_masked else bands, [raster.index], base, label, samples=samples
+            )
             if report.problem:
                 yield LostFile(raster.path, report.problem)
             else:
@@ -269,8 +275,10 @@ def write_rasters(
     *,
     overwrite: bool = True,
     listed: ListedFiles | None = None,
+    samples: Collection[str] = (),
 ) -> Iterator[IndexReport]:
-    """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
+    """Write `base`_<index>.tif and .png of a capture's bands, each atomically; `samples` are `Sidecar.input_samples` of
+    the capture, for `IndexRaster.is_of_other`.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
     band of an index is missing, not usable, not in the unit that the index needs, not as the sidecar has `listed` its
@@ -289,7 +297,7 @@ def write_rasters(
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and (file := _foreign_file(target)):
                     raise InputError(foreign(file, "folder"))
-                statistics = earlier or _write(index, chosen, target, source, reader)
+                statistics = earlier or _write(index, chosen, target, source, reader, samples)
             except (InputError, OutputError) as error:
                 yield IndexReport(label, index.name, problem=str(error))
                 continue
@@ -343,14 +351,13 @@ class IndexRaster:
             return index_of_formula(f"{self.name}={formula}")
         return None
 
-    def is_of_other(self, bands: Path) -> bool:
-        """Return True if this raster and a file of bands are of different captures. Their tags are compared: the id of
-        the capture, or camera and time if one of them has no id.
+    def is_of_other(self, bands: Path, samples: Collection[str]) -> bool:
+        """Return True if this raster and a file of bands are of different captures: by the ids in their tags, or by the
+        `samples` of the input of the bands if one of them has no id.
         """
-        own, others = self.tags, tags_of(bands)
-        known = [name for name in _OF_CAPTURE if own.get(name) and others.get(name)]
-        decisive = known[:1] if "CAPTURE_ID" in known else known
-        return any(own[name] != others[name] for name in decisive)
+        ids = self.tags.get("CAPTURE_ID"), tags_of(bands).get("CAPTURE_ID")
+        own = self.tags.get(_SAMPLES_TAG, "").split()
+        return ids[0] != ids[1] if all(ids) else bool(own and samples) and set(own).isdisjoint(samples)
 
     @property
     def is_masked(self) -> bool:
@@ -431,7 +438,7 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
 
 
 def _write(
-    index: Index, bands: Sequence[AlignedBand], target: Path, source: str, reader: BandReader
+    index: Index, bands: Sequence[AlignedBand], target: Path, source: str, reader: BandReader, samples: Collection[str]
 ) -> IndexStatistics:
     """Write the raster tile by tile, and its picture. Raises OutputError, InputError for a band."""
     unit = _common_unit(index, bands, reader)
@@ -442,11 +449,12 @@ def _write(
     # Percentiles of larger rasters are calculated from every second, third … row and column.
     max_statistics_px = 4_000_000
     step = max(1, math.ceil(math.sqrt(like.width * like.height / max_statistics_px)))
-    samples, valid_px, masked_px = [], 0, 0
+    shown, valid_px, masked_px = [], 0, 0
     unmasked = [replace(band, quality=None) for band in bands]
     is_cog = like.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG"
     is_masked = list(bands) != unmasked
     layers, tags = [geotiff.LayerDescription(index.name)], _tags(index, like, unit, source, is_masked=is_masked)
+    tags[_SAMPLES_TAG] = " ".join(sorted(samples))
     with geotiff.checked_raster(target, profile, layers, tags, geotiff.to_cog if is_cog else None) as (dataset, write):
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
             values = compute(index, [reader.values(band, tile) for band in bands])
@@ -456,8 +464,8 @@ def _write(
             if is_masked:
                 all_values = compute(index, [reader.values(band, tile) for band in unmasked])
                 masked_px += int(np.count_nonzero(np.isfinite(all_values) & ~valid))
-            samples.append(values[::step, ::step][valid[::step, ::step]])
-        sample = np.concatenate(samples)
+            shown.append(values[::step, ::step][valid[::step, ::step]])
+        sample = np.concatenate(shown)
         shares = (pixels / (like.width * like.height) for pixels in (valid_px, masked_px))
         statistics = _statistics(index, unit, sample, *shares)
         dataset.update_tags(**{_STATISTICS_TAG: json.dumps(statistics.as_json())})

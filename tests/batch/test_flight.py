@@ -286,6 +286,15 @@ def test_a_run_writes_its_record(flight: Path, tmp_path: Path) -> None:
     assert record.settings["joint"]["recipe"] == "fast"
 
 
+def test_an_interruption_is_not_hidden_by_a_page_that_cannot_be_written(flight: Path, tmp_path: Path) -> None:
+    first = run_flight(agalign.discover(flight), tmp_path, seeded())
+    next(first)
+    (tmp_path / "index.html").write_text("of the user")
+    with pytest.raises(KeyboardInterrupt):
+        first.throw(KeyboardInterrupt)
+    assert (tmp_path / "index.html").read_text() == "of the user"
+
+
 def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
     first = run_flight(agalign.discover(flight), tmp_path, seeded())
     next(first)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
+from synthetic_flights.aligned import make_aligned
 
 from agalign import __main__
 from agalign.batch.capture_report import CaptureReport
@@ -111,6 +112,26 @@ def test_wrong_arguments_are_one_line(flight: Path, tmp_path: Path, command: str
     assert "nput should" not in only
     assert "Value error" not in only
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("command", ["report {}", "align {}", "align {flight} -o {}"])
+def test_links_that_lead_back_to_themselves_are_one_line(flight: Path, tmp_path: Path, command: str) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    done = agalign_here(*(argument.format(loop, flight=flight) for argument in command.split(" ")))
+    assert done.returncode == 2
+    assert done.stderr.endswith("loop: its symbolic links lead back to themselves; give the path of a file or folder\n")
+
+
+@pytest.mark.parametrize("command", ["report", "indices", "verify"])
+def test_a_folder_of_runs_is_not_a_run(tmp_path: Path, command: str) -> None:
+    """With the pages of a run in it, it would not be searched for images any more."""
+    make_aligned(tmp_path / "one", 1)
+    (tmp_path / "one" / "agalign-run.json").touch()
+    done = agalign_here(command, tmp_path)
+    assert done.returncode == 1
+    assert f"{tmp_path}: contains runs, such as {tmp_path / 'one'}, and is none itself; give the folder" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["one"]
 
 
 NOT_LOCAL = (

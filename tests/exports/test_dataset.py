@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from synthetic_flights.aligned import list_stack
 
 import agalign
 
@@ -30,6 +31,19 @@ def test_a_capture_is_its_files(run: Path) -> None:
     file, index = (path, 4) if path.exists() else (path.with_name("IMG_0001_4.tif"), 1)
     with rasterio.open(file) as source:
         np.testing.assert_array_equal(dataset.NIR.values, source.read(index))
+
+
+@pytest.mark.parametrize("run", ["stack"], indirect=True)
+def test_numbers_with_a_scale_and_an_offset_are_values(run: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(run, tmp_path / "out"))
+    path = out / "0000SET" / "000" / "IMG_0001.tif"
+    before = agalign.open_capture(path).NIR.values
+    with rasterio.open(path, "r+") as file:
+        file.scales, file.offsets = (1e-4, 1e-4, 1e-4, 2e-4, 1e-4), (0.0, 0.0, 0.0, -0.1, 0.0)
+    list_stack(path.with_suffix(".json"))
+    np.testing.assert_allclose(agalign.open_capture(path).NIR.values, before * 2e-4 - 0.1, rtol=1e-5)
+    unscaled = agalign.open_capture(path, masked=False).NIR
+    assert (unscaled.attrs["scale_factor"], unscaled.attrs["add_offset"]) == (2e-4, -0.1)
 
 
 def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:

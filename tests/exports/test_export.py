@@ -70,6 +70,7 @@ def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path
     for out, target, program, error, message in (
         (tmp_path / "full", "to", "odm", agalign.InputError, "give the output folder of a run"),
         (run, "full", "odm", agalign.OutputError, "is not empty"),
+        (run, "/vsimem/x", "odm", agalign.OutputError, "is one of GDAL's virtual paths"),
         (without_files, "to", "pix4d", agalign.ConfigurationError, "--layout bands or both"),
         (degraded, "to", "pix4d", agalign.InputError, "no capture to export .*: its status is degraded"),
     ):

@@ -21,7 +21,7 @@ from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.report.pages import write_pages
 from agalign.report.pair_totals import PairTotals
 from agalign.values.alignment import Alignment, Seed
-from agalign.values.capture import Band
+from agalign.values.capture import Band, CameraIdentity
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
@@ -161,6 +161,8 @@ def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_fli
     assert cautions(run=run, output=output, captured_at="") != [], "a clock that was not set"
     (caution, *_) = cautions(run=RunFacts((panel(NIR=0.5),)), output=output)
     assert caution.size == pytest.approx(1.0)
+    other = run.panels[0].model_copy(update={"camera": CameraIdentity("MicaSense", "Altum", "AL01")})
+    assert cautions(run=RunFacts((other,)), output=output, **time) == [], "a panel of another camera"
 
 
 @pytest.mark.parametrize(

@@ -289,13 +289,15 @@ def test_the_exit_code_is_3_for_files_that_the_pages_lack(tmp_path: Path) -> Non
         assert ("IMG_0001.preview.jpg: is not what was written" in done.stderr, done.returncode) == (code == 3, code)
 
 
-def test_indices_of_another_flight_are_not_replaced(tmp_path: Path) -> None:
-    """Cameras give the captures of each flight the same names."""
-    for flight, day in (("one", 21), ("two", 22)):
+@pytest.mark.parametrize("ids", [("a", "b"), ("a", ""), ("", "")])
+def test_indices_of_another_flight_are_not_replaced(tmp_path: Path, ids: tuple[str, str]) -> None:
+    """Cameras give the captures of each flight the same names, and tags may be lost."""
+    for flight, capture_id in zip(("one", "two"), ids, strict=True):
         make_aligned(tmp_path / flight, 1)
-        with rasterio.open(tmp_path / flight / "0000SET" / "IMG_0001.tif", "r+") as stack:
-            stack.update_tags(TIFFTAG_DATETIME=f"2026:06:{day} 10:00:00")
-        list_stack(tmp_path / flight / "0000SET" / "IMG_0001.json")
+        path = tmp_path / flight / "0000SET" / "IMG_0001.json"
+        with rasterio.open(path.with_suffix(".tif"), "r+") as stack:
+            stack.update_tags(CAPTURE_ID=capture_id)
+        list_stack(path, read_sidecar(path).model_copy(update={"input_samples": {"NIR": f"sample of {flight}"[-3:]}}))
     target = tmp_path / "indices"
     (report,) = indices_of(tmp_path / "one", target=target)
     before = report.path.read_bytes()
@@ -459,6 +461,15 @@ def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
     assert report.kept
     listed = read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products
     assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
+
+
+def test_the_output_folder_of_another_run_takes_no_indices(tmp_path: Path) -> None:
+    """Its report would show them as its own."""
+    for name in ("one", "two"):
+        make_aligned(tmp_path / name, 1)
+    (tmp_path / "two" / "agalign-run.json").touch()
+    with pytest.raises(ConfigurationError, match="two: is the output folder of another run; choose another folder"):
+        indices_of(tmp_path / "one", target=tmp_path / "two")
 
 
 def test_the_output_folder_of_the_run_may_be_spelled_differently(
