@@ -148,7 +148,10 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
         planes = band.to_rig, band.other_to_rig
         to_rig, other = (None if h is None else geometry.rescale(h, scale, SAME_PIXELS) for h in planes)
         radiometry = band.radiometry and replace(band.radiometry.rescaled(scale), raw_step=1)
-        band = replace(band, lens=rescaled(band.lens, scale), to_rig=to_rig, other_to_rig=other, radiometry=radiometry)
+        panel = band.panel and band.panel.rescaled(scale)
+        band = replace(
+            band, lens=rescaled(band.lens, scale), to_rig=to_rig, other_to_rig=other, radiometry=radiometry, panel=panel
+        )
     if band.lens is None or band.lens.is_plausible(band.size_px):
         return band, ""
     why = consistency.lens_of_other_image(band)
@@ -156,7 +159,8 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
 
 
 def _without_lens(band: Band, why: str) -> Band:
-    band = replace(band, lens=None, to_rig=None, other_to_rig=None)
+    panel = band.panel and replace(band.panel, corners_px=())  # the image is searched for it
+    band = replace(band, lens=None, to_rig=None, other_to_rig=None, panel=panel)
     if band.radiometry is not None and band.radiometry.is_of_light:  # its vignetting is of the same image
         band = replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({why})")
     return band

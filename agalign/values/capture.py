@@ -15,6 +15,7 @@ from agalign.values.fields import RECORD, Name, Number, equal
 from agalign.values.geometry import Matrix
 from agalign.values.image import Tile
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import PixelScale
 from agalign.values.radiometry import Radiometry
 
 
@@ -83,6 +84,10 @@ class Panel:
     it is aligned."""
     cues: tuple[str, ...] = ()
     """Evidence that the image shows a panel, in words."""
+
+    def rescaled(self, scale: PixelScale) -> "Panel":
+        """Return the panel in the image resized by `scale`."""
+        return replace(self, corners_px=tuple((x, y) for x, y in map(scale.positions, self.corners_px)))
 
 
 @dataclass(frozen=True)

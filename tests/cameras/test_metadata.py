@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from PIL.ExifTags import Base
 
+from agalign.cameras import read_files
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, finite, read_tags
@@ -20,7 +21,7 @@ from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, rational,
 from agalign.cameras.xmp import Packet
 from agalign.pixels.radiometry import calibrated
 from agalign.values import geometry
-from agalign.values.capture import Capture, CaptureTime
+from agalign.values.capture import Capture, CaptureTime, Panel
 from agalign.values.pixel_units import PixelScale
 
 from .test_vendors import packet
@@ -187,6 +188,16 @@ def test_tags_in_pixels_follow_the_size_that_exif_names(flight: Path, tmp_path: 
         expected = cv2.resize(radiance, after.size_px, interpolation=cv2.INTER_AREA)
         np.testing.assert_allclose(reduced, expected, rtol=1e-3)
     assert small.pose.focal_length_px == pytest.approx(share * full.pose.focal_length_px)
+
+
+def test_the_area_of_a_panel_in_tags_follows_the_size_of_the_image(flight: Path) -> None:
+    """In an image of unknown size relative to the camera's, the panel is searched for."""
+    corners = ((100.0, 80.0), (140.0, 80.0), (140.0, 120.0), (100.0, 120.0))
+    band = replace(discover(flight).captures[0].bands[0], panel=Panel("tags", albedo=0.5, corners_px=corners))
+    half, small = PixelScale(0.5, 0.5), replace(band, width_px=band.width_px // 2, height_px=band.height_px // 2)
+    reduced, _ = read_files._with_lens_of_image(small, half)
+    np.testing.assert_allclose(reduced.panel.corners_px, half.positions(corners))
+    assert read_files._without_lens(band, "cropped").panel == Panel("tags", albedo=0.5)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
