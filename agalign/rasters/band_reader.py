@@ -23,6 +23,8 @@ from agalign.values.spectrum import with_wavelength
 
 RAW = "raw numbers"
 """Unit of bands that are neither reflectance nor radiance."""
+UNSTATED = "unstated, in the range of reflectance"
+"""Unit of bands that may be reflectance or radiance: no tag states it."""
 _SAMPLE_PX = 512
 """Longer side of the reduced band from which the unit is inferred if no tag states it."""
 
@@ -60,8 +62,7 @@ class BandReader(ExitStack):
     def units(self, band: AlignedBand) -> list[str]:
         """Return the units of a band's numbers: one, unless the tag of a stack lists several.
 
-        Without radiometry tags, numbers that the file's scale brings into the range of reflectance are reflectance.
-        Raises InputError.
+        Without radiometry tags, it is RAW or UNSTATED. Raises InputError.
         """
         source = self.file(band.file, band.band_index)
         if quantity := self.quantity(band):
@@ -73,7 +74,7 @@ class BandReader(ExitStack):
         values = _scaled(source, band.band_index, Window(0, 0, *size_px), sample_px[::-1])
         known = values[np.isfinite(values)]
         low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 0.0)
-        return ["reflectance"] if low >= -MAX_REFLECTANCE and high <= MAX_REFLECTANCE else [RAW]
+        return [UNSTATED] if low >= -MAX_REFLECTANCE and high <= MAX_REFLECTANCE else [RAW]
 
     def values(self, band: AlignedBand, tile: Tile) -> FloatImage:
         """Return (height, width) of a tile, scaled as the file states; nan where nodata or flagged as unusable.

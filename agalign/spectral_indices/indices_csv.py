@@ -13,6 +13,7 @@ from agalign.errors import InputError
 from agalign.host.files import INDICES_FILE, PAGE_STARTS, read_regular, write_csv
 from agalign.host.own_files import refuse_foreign
 from agalign.host.text import without_formula
+from agalign.rasters.band_reader import UNSTATED
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import renamed_captures
 from agalign.records.sidecar import Sidecar
@@ -31,7 +32,8 @@ def to_check(index: Index | None, unit: str, sidecar: Sidecar, run: RunFacts, la
         return ""
     result = []
     if not index.any_unit and unit != "reflectance":
-        result.append(f"its value depends on the unit of the bands, which are {unit}, not reflectance")
+        what = "which no tag states" if unit == UNSTATED else f"which are {unit}, not reflectance"
+        result.append(f"its value depends on the unit of the bands, {what}")
     with suppress(InputError):  # other bands than those of the sidecar
         names = [b.band for b in sidecar.bands]
         used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}

@@ -26,7 +26,7 @@ from agalign.host.text import shortened
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters import geotiff
 from agalign.rasters.aligned_files import tags_of
-from agalign.rasters.band_reader import RAW, BandReader
+from agalign.rasters.band_reader import RAW, UNSTATED, BandReader
 from agalign.rasters.drawing import with_text, write_png
 from agalign.rasters.product import CapturePaths, LostFile, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand, bands_of, quality_layers
@@ -431,7 +431,7 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
     if len(units) > 1:
         raise InputError(f"its bands are in different units ({', '.join(sorted(units))})")
     (unit,) = units
-    if not (index.any_unit or index.is_of_user) and unit != "reflectance":
+    if not (index.any_unit or index.is_of_user) and unit not in ("reflectance", UNSTATED):
         remedy = "a calibration panel gives it" if unit == "relative reflectance" else "align with --radiometry"
         raise InputError(f"needs reflectance, and the bands are {unit}; {remedy}")
     return unit

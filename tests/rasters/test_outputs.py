@@ -15,7 +15,7 @@ from agalign.batch.output_files import refuse_to_overwrite
 from agalign.cameras.tag_seeds import geo_seed
 from agalign.errors import ConfigurationError
 from agalign.rasters.aligned_files import band_file_names
-from agalign.rasters.band_reader import RAW, BandReader
+from agalign.rasters.band_reader import RAW, UNSTATED, BandReader
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar_file import verify_outputs
 from agalign.synthetic import flight as synthetic
@@ -291,7 +291,7 @@ def test_options_go_together(shared: Shared, tmp_path: Path, options: dict[str, 
     assert np.corrcoef(planes["Green"][both], planes["Red"][both])[0, 1] > 0.6
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1.0, "reflectance"), (60_000.0, RAW)])
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, UNSTATED), (60_000.0, RAW)])
 def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float, unit: str) -> None:
     scene = (textured_image(320, 240, 5) * 0.05 + 0.4).clip(0, 1) * factor
     write_band(tmp_path / "a.tif", scene.astype(np.float32))

@@ -20,7 +20,7 @@ from synthetic_flights.aligned import list_stack, make_aligned
 from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError, OutputError, WorkerError
-from agalign.rasters.band_reader import RAW
+from agalign.rasters.band_reader import RAW, UNSTATED
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import FilePart
@@ -187,6 +187,19 @@ def test_pixels_that_the_percentiles_skip_are_valid(tmp_path: Path) -> None:
     (report,) = write_rasters(bands, [INDICES["ndvi"]], tmp_path / "a", "a")
     assert np.isnan(report.median)
     assert report.statistics.valid_share == pytest.approx(0.25, abs=1e-3)
+
+
+def test_an_index_that_needs_reflectance_says_that_no_tag_states_it(tmp_path: Path) -> None:
+    """Numbers from 0 to 1 may be radiance."""
+    make_aligned(tmp_path, 1)
+    path = tmp_path / "0000SET" / "IMG_0001.json"
+    with rasterio.open(path.with_suffix(".tif")) as stack:
+        pixels = stack.read()
+    write_band(path.with_suffix(".tif"), pixels, nodata=np.nan)
+    list_stack(path)
+    (savi,) = indices_of(tmp_path, "savi")
+    assert savi.statistics.unit == UNSTATED
+    assert savi.problem == "its value depends on the unit of the bands, which no tag states"
 
 
 def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> None:
