@@ -64,8 +64,6 @@ class Option:
     """Returns the value of the field for that of the option."""
     alone: str = ""
     """Its value if it is given without one."""
-    former: str = ""
-    """A deprecated name, with its dashes."""
     path: tuple[str, ...] = ()
     """Names of the model (settings, discover or run), of the stage, if any, and of the field."""
     info: Mapping[str, Any] = field(default_factory=dict)
@@ -268,9 +266,7 @@ class ReliefSettings(SettingsModel):
 
     # A single moving lens gets a smooth displacement field instead, if left-out windows confirm it: no other band can
     # verify its relief.
-    use: Annotated[
-        choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")
-    ] = "auto"
+    use: Annotated[choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always")] = "auto"
     """Correct parallax (trees, terraces, close range) by a parallax map or a displacement field: always, never, or if
     the windows show parallax (auto). --relief alone means always."""
 

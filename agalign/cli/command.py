@@ -215,10 +215,10 @@ class _Command(TyperCommand):
 
 
 class _LenientCommand(_Command):
-    """A command that takes options under their former names, and some options without a value."""
+    """A command that takes some options without a value."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, after options are renamed and get their missing values."""
+        """Parse the arguments, after options get their missing values."""
         own = {param.name for param in self.params}
         for option in field_options().values():
             if option.alone and option.name in own:
@@ -229,13 +229,9 @@ class _LenientCommand(_Command):
 def _completed(args: list[str], option: "Option") -> list[str]:
     result = []
     for argument, following in pairwise([*args, ""]):
-        name, equals, value = argument.partition("=")
-        if name and name == option.former:
-            Terminal(log_json="--log-json" in args).problem(f"{name} is deprecated; use {option.flag}")
-            name = option.flag
-        result.append(f"{name}{equals}{value}")
+        result.append(argument)
         # A word that is neither an option nor a path is a misspelt choice.
         is_value = following in get_args(option.type) or (following.isalnum() and not os.path.exists(following))  # noqa: PTH110 - Path raises OSError for a long name
-        if name == option.flag and not equals and not is_value:
+        if argument == option.flag and not is_value:
             result.append(option.alone)
     return result

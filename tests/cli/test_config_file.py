@@ -124,20 +124,17 @@ def test_the_printed_file_has_every_option_and_changes_nothing(tmp_path: Path) -
         ("align flight --relief=never", "never"),
         ("align flight --relief --relief-map --fill-occluded", "always"),
         ("align --relief flight", "always"),
-        ("align flight --local -q", "always"),
-        ("align flight --local=never", "never"),
-        ("onto a.tif b.tif --local", "always"),
+        ("onto a.tif b.tif --relief", "always"),
     ],
 )
-def test_relief_is_always_and_local_its_old_name(
-    arguments: str, relief: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_relief_without_a_value_is_always(
+    arguments: str, relief: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "flight").mkdir()  # a folder after --relief is not its value
     values = parameters(*arguments.split())
     assert values["relief"] == relief
     assert values.get("folder", Path("flight")) == Path("flight")
-    assert ("--local is deprecated; use --relief" in capsys.readouterr().err) == ("--local" in arguments)
 
 
 def test_a_dry_run_prints_its_plan_and_writes_nothing(flight: Path, tmp_path: Path) -> None:
