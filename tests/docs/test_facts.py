@@ -234,3 +234,20 @@ def test_columns_of_the_tables_that_a_run_writes(tmp_path: Path) -> None:
 def test_kinds_of_products() -> None:
     listed = re.findall(r"`(\w+)`", FilePart.model_fields["kind"].description or "")
     assert set(listed) == {PARALLAX_KIND, *(p.kind for p in PRODUCTS)}
+
+
+PLACES = [
+    re.findall(r"`([^`]+)`", cells)
+    for cells in re.findall(
+        r"^\| [^|]+ \| (`\w+(?:/\w+)*\.\w+` \| (?:`\w+`(?:, )?)*) \|$", text_of(ROOT / "CONTRIBUTING.md"), re.M
+    )
+]
+
+
+def test_the_table_of_places_names_what_its_modules_define() -> None:
+    min_rows = 150
+    assert len(PLACES) > min_rows
+    for module, *names in PLACES:
+        text = (ROOT / "agalign" / module).read_text(encoding="utf-8")
+        defined = r"^\s*(?:def|class) {0}\b|^\s*(?:[A-Za-z_, ]*\b)?{0}\b[^=\n(]*="
+        assert [name for name in names if not re.search(defined.format(name), text, re.MULTILINE)] == [], module
