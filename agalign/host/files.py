@@ -234,11 +234,10 @@ def path_problem(path: Path) -> str:
         limits = f"file systems take {_MAX_PART_BYTES} bytes a name and {_MAX_ARGUMENT_BYTES:,} a path"
         return f"{shortened(text)}: has {what}, and {limits}; give a shorter path"
     try:
-        path.resolve()
-    except (RuntimeError, OSError) as error:  # before and since Python 3.13
-        if isinstance(error, OSError) and error.errno != errno.ELOOP:
-            return ""
-        return f"{text}: its symbolic links lead back to themselves; give the path of a file or folder"
+        path.stat()
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return f"{text}: its symbolic links lead back to themselves; give the path of a file or folder"
     if text.startswith("/vsi"):
         return f"{text}: is one of GDAL's virtual paths; mount or unpack it, and give the local path"
     # A Path writes s3://bucket or https://host with one slash; a drive has one letter.
