@@ -120,12 +120,13 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
     parts = [Residual(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
     with open_raster(moving.path, moving.page) as source:
-        for number, (tile, windows) in enumerate(tiles):
+        for tile, windows in tiles:
             # GDAL's block cache serves neighbouring tiles of the open file.
             warped = resample_tile(moving, mapping, tile, "lanczos", read=partial(read_tile, dataset=source))
             part = windows.residuals(_raster(*warped, moving))
-            # Each tile has its own columns of cells, from an even one: a chessboard of its windows.
-            origin_px, first_cell = np.array([tile.x0, tile.y0]), np.array([2 * _TILE_PX * number, 0])
+            # The cells of neighbouring tiles are adjacent, as a misaligned area may be in several.
+            origin_px, size_px = np.array([tile.x0, tile.y0]), np.array([tile.width, tile.height])
+            first_cell = (origin_px + size_px / 2).astype(np.int64) // size_px * (size_px // windows.side)
             parts.append(replace(part, centres_px=part.centres_px + origin_px, cells=part.cells + first_cell))
     return Residual.joined(parts)
 

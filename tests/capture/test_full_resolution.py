@@ -110,7 +110,7 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
 def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
     """Adjacent windows have different colours wherever a tile is, and none have the same cell."""
     reference, moving = capture.reference, capture.moving[0]
-    tiles = [Tile(30, 10, 610, 330), Tile(30, 450, 610, 330)]
+    tiles = [Tile(30, 10, 360, 330), Tile(400, 10, 360, 330), Tile(30, 450, 360, 330)]
     with open_raster(reference.path, reference.page) as source:
         chosen = [(tile, full_resolution._windows(source, reference, tile)) for tile in tiles]
     residual = full_resolution._residual(moving, PixelMapping(TRUTH), chosen)
@@ -120,6 +120,11 @@ def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
     assert len(first) > 40
     colours = chessboard(residual).numbers
     assert (colours[first] != colours[second]).all()
+    in_first, in_second = (
+        (residual.centres_px >= (t.x0, t.y0)) & (residual.centres_px < (t.x0 + t.width, t.y0 + t.height))
+        for t in tiles[:2]
+    )
+    assert residual.cells[in_second.all(axis=1), 0].min() - residual.cells[in_first.all(axis=1), 0].max() == 1
 
 
 def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture, pair: BandPair) -> None:
