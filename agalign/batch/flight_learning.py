@@ -59,8 +59,8 @@ def learn_flight(
     threads: int = 1,
     timeout_s: float | None = None,
 ) -> FlightModel | None:
-    """Return a model learned from a few captures spread over the flight, without its fingerprint; None if none of them
-    could be aligned.
+    """Return a model learned from a few captures spread over the flight, without its fingerprint; None if none of three
+    or more could be aligned and there is no `start`. The network of fewer captures is not trained on them.
 
     `run_tasks` processes single captures, and `threads` train the network; the result does not depend on them. Captures
     that exceed the time limit are not learned from.

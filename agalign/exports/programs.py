@@ -21,8 +21,8 @@ from agalign.host.files import (
 )
 from agalign.host.text import counted
 from agalign.rasters.aligned_files import BandFiles
-from agalign.rasters.band_reader import like_most
-from agalign.records.captures import LeftOut, RunCapture, captures_of_run
+from agalign.rasters.band_reader import UNSTATED, BandReader, like_most
+from agalign.records.captures import AlignedBand, LeftOut, RunCapture, captures_of_run
 from agalign.values.choices import ExportProgram
 
 _NOTES: dict[ExportProgram, str] = {
@@ -150,7 +150,7 @@ def _notes(program: ExportProgram, captures: Sequence[RunCapture], files: Sequen
     if program == "odm":
         radiometry = "; ".join(sorted({output.radiometry or "" for output in outputs}))
         again = {"calibration": "none", "contents": f"{radiometry}: OpenDroneMap must not calibrate them again."}
-        facts |= again if radiometry else _of_raw_numbers(files)
+        facts |= again if radiometry else _without_radiometry(files)
     notes = _NOTES[program].format(**facts).splitlines()
     flat = sum(output.vignetting_corrected for output in outputs)
     if flat:
@@ -158,10 +158,14 @@ def _notes(program: ExportProgram, captures: Sequence[RunCapture], files: Sequen
     return notes
 
 
-def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
-    """The option of OpenDroneMap for files with raw numbers. It reads the horizontal irradiance of a light sensor under
-    this name, and without its unit as W / m^2 / nm; other irradiances are not in the unit of its radiance.
+def _without_radiometry(files: Sequence[Path]) -> dict[str, str]:
+    """The option of OpenDroneMap for files that agalign did not convert. It reads the horizontal irradiance of a light
+    sensor under this name, and without its unit as W / m^2 / nm; other irradiances are not in the unit of its radiance.
     """
+    with BandReader() as reader:
+        if UNSTATED in reader.units(AlignedBand("", None, files[0], 1)):
+            contents = f"numbers whose unit is {UNSTATED}: OpenDroneMap must not calibrate them."
+            return {"calibration": "none", "contents": contents}
     names = (pix4d.NAMESPACE, "HorizontalIrradiance"), (pix4d.NAMESPACE, "IrradianceScaleToSIUnits")
     tags = (read_tags(path) for path in files)
     if all(t.number(*name) for t in tags for name in names if t.text(pix4d.NAMESPACE, "BandName") != "LWIR"):

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +50,7 @@ def learn_rig(
     fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors)
     offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), zip(bands, fitted[:, 6:8].tolist(), strict=True)
     by_capture = zip(captures, nu_w.tolist(), strict=True)
-    lengths = {b: math.hypot(x, y) for b, (x, y) in zip(bands, fitted[:, 6:8].tolist(), strict=True)}
-    return Rig(
+    result = Rig(
         size_px=size_px,
         mean={b: rig.displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
         baselines={b: (x, y) for b, (x, y) in lenses},
@@ -59,25 +59,27 @@ def learn_rig(
         factors=factors,
         captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
         from_bands_px=dict(zip(bands, errors_px.tolist(), strict=True)),
-        parallax_px=_parallax_px(captures, lengths),
     )
+    return replace(result, parallax_px=_parallax_px(captures, result))
 
 
-def _parallax_px(captures: Sequence[Observation], lengths: Mapping[str, float]) -> dict[str, float]:
-    """Return the RMS displacement of each band by the reliefs of the captures, px of the reference, given the lengths
-    of the bands' baselines.
+def _parallax_px(captures: Sequence[Observation], learned: Rig) -> dict[str, float]:
+    """Return the RMS displacement of each band by the reliefs of the captures, px of the reference.
 
     A band without a relief in a capture that has one, such as a thermal band, gets that of the other bands, as the
-    displacement is proportional to the baseline.
+    displacement is proportional to the baseline; the largest if delays hide the baselines.
     """
+    lengths = {band: math.hypot(*baseline) for band, baseline in learned.baselines.items()}
     squares_px2: dict[str, list[float]] = {band: [] for band in lengths}
     for capture in captures:
         known = [(lengths[b], px) for b, px in capture.parallax_px.items() if b in lengths]
         square = sum(length**2 for length, _ in known)
         per_length_px = sum(length * px for length, px in known) / square if square > 0 else 0.0
+        largest_px = max(capture.parallax_px.values(), default=0.0)
         for band, length in lengths.items():
             if band in capture.mappings:
-                squares_px2[band].append(capture.parallax_px.get(band, per_length_px * length) ** 2)
+                by_others_px = largest_px if rig.has_delays(learned.factors) else per_length_px * length
+                squares_px2[band].append(capture.parallax_px.get(band, by_others_px) ** 2)
     return {band: float(np.sqrt(np.mean(squares))) for band, squares in squares_px2.items()}
 
 

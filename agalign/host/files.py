@@ -164,11 +164,21 @@ def remove_partial_files(folder: Path, *, below: bool = True) -> None:
 
     Partial files in output folders of other runs, of running processes and of other machines are kept.
     """
-    for parent, folders, names in os.walk(folder):
-        for name in (*folders, *names):
+    for parent, folders, files in folders_of_run(folder):
+        for name in (*folders, *files):
             if name.startswith(_PARTIAL) and _is_left_over(name):
                 _remove(Path(parent, name))
-        folders[:] = [f for f in folders if below and not os.path.exists(Path(parent, f, RUN_FILE))]  # noqa: PTH110 - it may not be readable
+        if not below:
+            return
+
+
+def folders_of_run(out: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yield an output folder and those below it, with the names of the folders and files there, as `os.walk` does,
+    without the output folders of other runs.
+    """
+    for parent, folders, files in os.walk(out):
+        yield parent, folders, files
+        folders[:] = [f for f in folders if not os.path.exists(Path(parent, f, RUN_FILE))]  # noqa: PTH110 - it may not be readable
 
 
 def _remove(path: Path) -> None:

@@ -38,7 +38,7 @@ def resample_tile(
     `size_px` is (width, height) of that grid, with which a pixel has the same value in any tile.
 
     The type is that of the band, with integers rounded and clipped, or float32 if calibrated with `radiometry`. A pixel
-    is valid if its position is inside the moving image and not occluded, and no invalid pixel contributes to it.
+    is valid if its position is inside the moving image and not occluded, and the pixels next to the position are valid.
     `read` reads the pixels of the file. Raises UnreadableFileError.
     """
     positions, source = source_positions(mapping, tile, size_px, band.size_px)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
@@ -19,14 +18,14 @@ from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, relief_of
 from agalign.values.capture import Band, Capture
-from agalign.values.choices import QUALITY_MEANINGS, Quality
+from agalign.values.choices import QUALITY_MEANINGS, Interpolation, Quality
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MAX_PIXEL_ERROR_PX, ErrorOnGrid
 from agalign.values.parallax import Relief, rounded
-from agalign.values.resampling import source_positions, tiles
+from agalign.values.resampling import is_under_kernel, source_positions, tiles
 
 _SHARE_LATTICE_PX = 64
 """Distance of the nodes for a share of the image: 300 nodes of a RedEdge determine it to 2 %, in 2 ms."""
@@ -113,9 +112,12 @@ class QualityRaster(Product):
         errors = {name: error_map(a, reference, grid) for name, a in context.with_pixels.items()}
         predicted = {name for name, alignment in context.with_pixels.items() if alignment.status == "predicted"}
 
+        interpolation = context.settings.write.interpolation
+
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [
-                _flags(layer, tile, grid, errors, is_predicted=layer.band.name in predicted) for layer in context.layers
+                _flags(layer, tile, grid, errors, interpolation, is_predicted=layer.band.name in predicted)
+                for layer in context.layers
             ]
             return [np.bitwise_or.reduce(bands), *bands]
 
@@ -133,13 +135,19 @@ class QualityRaster(Product):
 
 
 def _flags(
-    layer: Layer, tile: Tile, grid: OutputGrid, errors: Mapping[str, ErrorOnGrid | None], *, is_predicted: bool
+    layer: Layer,
+    tile: Tile,
+    grid: OutputGrid,
+    errors: Mapping[str, ErrorOnGrid | None],
+    interpolation: Interpolation,
+    *,
+    is_predicted: bool,
 ) -> Flags:
     """Flags (height, width) of a band on a tile; `errors` has the expected error by band, None if it is unknown."""
     if layer.is_gap:
         return np.full((tile.height, tile.width), Quality.MISSING.value, np.uint16)
     result = np.full((tile.height, tile.width), Quality.PREDICTED.value if is_predicted else 0, np.uint16)
-    masks = _of_source(layer, tile)
+    masks = _of_source(layer, tile, interpolation)
     if layer.band.name in errors:
         error = errors[layer.band.name]
         on_grid = Tile(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
@@ -152,7 +160,7 @@ def _flags(
     return result
 
 
-def _of_source(layer: Layer, tile: Tile) -> dict[Quality, Mask]:
+def _of_source(layer: Layer, tile: Tile, interpolation: Interpolation) -> dict[Quality, Mask]:
     """The flags of a band's file on a tile, each (height, width)."""
     band = layer.band
     if layer.mapping is None:
@@ -163,22 +171,15 @@ def _of_source(layer: Layer, tile: Tile) -> dict[Quality, Mask]:
     if source is None:
         return {Quality.OUTSIDE: ~inside}
     pixels, valid = layer.read(band, source)
+    of_validity: Interpolation = "nearest" if interpolation == "nearest" else "bilinear"  # as in `resample`
     in_window = (positions - (source.x0, source.y0)).astype(np.float32)
     is_saturated = saturated(valid, pixels, band.saturation_value)
     return {
         Quality.OUTSIDE: ~inside,
-        Quality.NODATA: inside & _contributes(~valid, in_window),
-        Quality.SATURATED: inside & _contributes(is_saturated, in_window),
+        Quality.NODATA: inside & is_under_kernel(~valid, in_window, of_validity),
+        Quality.SATURATED: inside & is_under_kernel(is_saturated, in_window, interpolation),
         Quality.OCCLUDED: inside & layer.mapping.hidden(tile),
     }
-
-
-def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:
-    """True where one of the four pixels around a position is in the mask."""
-    if not mask.any():
-        return np.zeros(positions.shape[:2], dtype=bool)
-    weight = cv2.remap(mask.astype(np.float32), positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(weight > 1e-3)  # smaller weights are rounding errors
 
 
 class ReliefMap(Product):

@@ -10,7 +10,15 @@ from typing import Any
 from pydantic import ValidationError
 
 from agalign.errors import InputError, Reason, SidecarError
-from agalign.host.files import RUN_FILE, compact_lists, file_checksum, open_regular, read_regular, write_text
+from agalign.host.files import (
+    RUN_FILE,
+    compact_lists,
+    file_checksum,
+    folders_of_run,
+    open_regular,
+    read_regular,
+    write_text,
+)
 from agalign.host.text import shortened
 from agalign.records.listed_files import ListedFiles, file_problem
 from agalign.records.sidecar import SCHEMA, FilePart, Sidecar
@@ -134,11 +142,12 @@ def check_products(paths: Iterable[Path]) -> None:
 
 
 def find_sidecars(folder: Path) -> list[Path]:
-    """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files and hidden
-    ones, such as partial files of another command, are not.
+    """Return the sidecars below an output folder, sorted; unreadable files are included; other JSON files, hidden ones,
+    such as partial files of another command, and those of other runs in it are not.
     """
-    named = (path for path in sorted(folder.rglob("*.json")) if not path.name.startswith("."))
-    return [path for path in named if not path.is_dir() and is_sidecar(path)]
+    files = (Path(parent, name) for parent, _, names in folders_of_run(folder) for name in names)
+    named = (path for path in sorted(files) if path.suffix == ".json" and not path.name.startswith("."))
+    return [path for path in named if is_sidecar(path)]
 
 
 def is_sidecar(path: Path) -> bool:

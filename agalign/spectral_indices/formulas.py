@@ -248,7 +248,8 @@ def _checked(index: Index) -> Index:
     if unknown or not index.symbols:
         used = ", ".join(unknown) or "no band"
         raise ConfigurationError(f"index '{index.name}', {index.formula}, uses {used}; the bands are B, G, R, RE and N")
-    bands = [np.array([0.1 * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
+    # No sums and differences of which a divisor could be made are equal.
+    bands = [np.array([0.07 * k + 0.013 * k * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
     scaled = [b * np.float32(1000) for b in bands]
     any_unit = np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True)
     return replace(index, any_unit=bool(any_unit))

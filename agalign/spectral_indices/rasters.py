@@ -75,7 +75,7 @@ class IndexStatistics:
     valid_share: float = 0.0
     """Share of the pixels that are valid, 0 to 1."""
     unit: str = ""
-    """Unit of the bands: reflectance, radiance, or raw numbers."""
+    """Unit of the bands: a `Quantity`, or that it is raw numbers or unstated."""
     low: float = math.nan
     """Value at the lower end of the colour scale of the picture."""
     high: float = math.nan
@@ -297,6 +297,8 @@ def write_rasters(
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and (file := _foreign_file(target)):
                     raise InputError(foreign(file, "folder"))
+                if not overwrite and (change := listed.problem(target)) and IndexRaster.read(target) is not None:
+                    raise InputError(f"{change}; --overwrite replaces it")
                 statistics = earlier or _write(index, chosen, target, source, reader, samples)
             except (InputError, OutputError) as error:
                 yield IndexReport(label, index.name, problem=str(error))

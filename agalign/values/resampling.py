@@ -17,7 +17,7 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import Size
 
 _KERNEL_PX = {"cubic": 4, "lanczos": 8}
-"""Sides of the kernels with negative weights."""
+"""Sides of the kernels with negative weights, which are wider than two pixels."""
 _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
 MIN_VALID_WEIGHT = 0.999
@@ -244,6 +244,17 @@ def _range_under_kernel(
         for f in (cv2.erode, cv2.dilate)
     )
     return np.asarray(low), np.asarray(high)
+
+
+def is_under_kernel(mask: Mask, positions: NDArray[np.float32], interpolation: Interpolation) -> Mask:
+    """Return True (H, W) where a pixel of a mask (h, w) contributes to a value at a position (H, W, 2)."""
+    if not mask.any():
+        return np.zeros(positions.shape[:2], dtype=bool)
+    if interpolation in _KERNEL_PX:
+        return _range_under_kernel(mask.astype(np.uint8), positions, _KERNEL_PX[interpolation])[1].astype(bool)
+    kernel = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
+    weight = cv2.remap(mask.astype(np.float32), positions, None, kernel, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(weight > 1e-3)  # smaller weights are rounding errors
 
 
 def between(positions: NDArray[np.floating], minimum: Points, maximum: Points) -> Mask:

@@ -3,15 +3,16 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import agalign
 from agalign.cli.terminal import ExitCode
-from agalign.exports.programs import export
+from agalign.exports.programs import _without_radiometry, export
 from agalign.records.sidecar_file import find_sidecars
 from agalign.values.choices import ExportProgram
 
-from ..conftest import Shared, read_json, seeded, write_signed
+from ..conftest import Shared, read_json, seeded, write_band, write_signed
 from ..program import agalign_here
 from ..run_outputs import change
 
@@ -58,6 +59,12 @@ def test_python_exports_and_computes_indices_as_the_commands(run: Path, aligned_
         assert path.read_bytes() == next((tmp_path / "by_command").rglob(path.name)).read_bytes()
     with pytest.raises(agalign.ConfigurationError, match="'ndvi' is given twice"):
         agalign.indices(run, ["ndvi", "NDVI"])
+
+
+def test_numbers_that_may_be_reflectance_are_not_calibrated_again(tmp_path: Path) -> None:
+    for factor, calibration in ((0.5, "none"), (6000.0, "camera")):
+        write_band(tmp_path / "a.tif", np.full((64, 80), factor, np.float32))
+        assert _without_radiometry([tmp_path / "a.tif"])["calibration"] == calibration
 
 
 def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from agalign.flight.learn_rig import learn_rig
+from agalign.flight.learn_rig import _parallax_px, learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px, expected_square
 from agalign.flight.rig_prediction import contradicts, predict_band, unobserved_error_px
 from agalign.values import geometry
@@ -128,6 +128,9 @@ def test_a_band_without_a_relief_has_the_parallax_of_the_others_by_its_baseline(
     assert lengths["NIR"] > 0
     assert learned.parallax_px["NIR"] == pytest.approx(3.0 * lengths["NIR"] / lengths["Red"])
     assert learn_rig(flight(4), SIZE, {}).parallax_px == dict.fromkeys(learned.mean, 0.0)
+    # Baselines orthogonal to delays are not those of the lenses.
+    with_delays = replace(learned, factors=("motion",), baselines=dict.fromkeys(learned.mean, (0.0, 0.0)))
+    assert _parallax_px(captures, with_delays) == pytest.approx(dict.fromkeys(learned.mean, 3.0))
 
 
 @pytest.mark.slow

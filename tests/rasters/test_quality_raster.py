@@ -10,6 +10,7 @@ import pytest
 import rasterio
 
 import agalign
+from agalign.pixels.band_resampling import resample_tile
 from agalign.rasters.alignment_maps import _flags, error_map, moved_share, share_over_1_px
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import bands_of
@@ -18,7 +19,7 @@ from agalign.spectral_indices.formulas import index_named, index_of_formula
 from agalign.spectral_indices.rasters import write_rasters
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
-from agalign.values.choices import UNUSABLE_QUALITY, Quality
+from agalign.values.choices import UNUSABLE_QUALITY, Interpolation, Quality
 from agalign.values.image import OutputGrid, Tile
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
@@ -42,9 +43,13 @@ def band(path: Path) -> Band:
 
 
 def flags_of(
-    layer: Layer, errors: dict[str, ErrorOnGrid | None] | None = None, *, is_predicted: bool = False
+    layer: Layer,
+    errors: dict[str, ErrorOnGrid | None] | None = None,
+    interpolation: Interpolation = "bilinear",
+    *,
+    is_predicted: bool = False,
 ) -> np.ndarray:
-    return _flags(layer, GRID.tile, GRID, errors or {}, is_predicted=is_predicted)
+    return _flags(layer, GRID.tile, GRID, errors or {}, interpolation, is_predicted=is_predicted)
 
 
 def test_flags_of_a_moved_band_are_where_its_pixels_are(tmp_path: Path) -> None:
@@ -59,6 +64,25 @@ def test_flags_of_a_moved_band_are_where_its_pixels_are(tmp_path: Path) -> None:
     rows, columns = np.nonzero(flags & Quality.NODATA)
     assert (rows.min() + 2, rows.max() + 2, x[columns.min()], x[columns.max()]) == (30, 32, 39.5, 41.5)
     assert np.count_nonzero(flags & ~np.uint16(Quality.OUTSIDE)) == 4 * 5 + 3 * 3
+
+
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear", "cubic", "lanczos"])
+def test_every_value_that_saturated_pixels_change_is_flagged(tmp_path: Path, interpolation: Interpolation) -> None:
+    """Wide kernels change values four pixels away; no others are flagged."""
+    saturated = np.zeros((60, 80), bool)
+    saturated[20:32, 30:42] = True
+    values, mapping = [], PixelMapping(geometry.translation(-10.5, 0.3))
+    for number in (65535, 10_000):
+        path = tmp_path / f"{number}.tif"
+        write_band(path, np.where(saturated, number, 10_000).astype(np.uint16))
+        layer = Layer(Band("NIR", path, 1, 80, 60, "uint16", saturation_value=65535.0), mapping)
+        values.append(resample_tile(layer.band, mapping, GRID.tile, interpolation)[0].astype(float))
+    bright = Layer(replace(layer.band, path=tmp_path / "65535.tif"), mapping)
+    is_flagged = (flags_of(bright, interpolation=interpolation) & Quality.SATURATED) > 0
+    is_changed = values[0] != values[1]
+    assert is_flagged[is_changed].all()
+    near = cv2.dilate(is_changed.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not is_flagged[~near].any()
 
 
 def test_flags_of_the_reference_are_those_of_its_own_pixels(tmp_path: Path) -> None:

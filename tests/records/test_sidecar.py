@@ -62,6 +62,15 @@ def example(**changes: Any) -> Sidecar:
     return Sidecar.model_validate_json(to_json(facts))
 
 
+def test_the_sidecars_of_a_run_inside_of_another_are_its_own(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "0000SET", tmp_path / "second" / "0000SET"):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_sidecar(folder / "IMG_1.json", example())
+    (tmp_path / "second" / "agalign-run.json").touch()
+    assert find_sidecars(tmp_path) == [tmp_path / "0000SET" / "IMG_1.json", tmp_path / "IMG_1.json"]
+    assert find_sidecars(tmp_path / "second") == [tmp_path / "second" / "0000SET" / "IMG_1.json"]
+
+
 @pytest.mark.slow
 def test_a_sidecar_names_its_images(flight: Path, aligned_flight: Path) -> None:
     folder = Path(read_json(aligned_flight / "agalign-run.json")["input"])

@@ -140,6 +140,7 @@ def test_the_catalogue_gives_names_and_constants() -> None:
     wdrvi = index_named("WDRVI")
     assert (wdrvi.symbols, wdrvi.constants, wdrvi.any_unit) == (("N", "R"), (("alpha", 0.1),), True)
     assert not index_named("evi2").any_unit
+    assert index_named("iavi").any_unit
     with pytest.raises(ConfigurationError, match="uses S1"):
         index_named("ndbi")
 
@@ -474,6 +475,21 @@ def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
     assert report.kept
     listed = read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products
     assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
+
+
+def test_an_index_raster_that_a_user_has_edited_is_not_replaced(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    (report,) = indices_of(tmp_path)
+    with rasterio.open(report.path, "r+") as raster:
+        raster.write(np.zeros((40, 160), np.float32), 1, window=((0, 40), (0, 160)))
+    edited = report.path.read_bytes()
+    (kept,) = indices_of(tmp_path)
+    assert kept.problem.endswith(
+        "is not what was written; delete it and run 'agalign indices' again; --overwrite replaces it"
+    )
+    assert report.path.read_bytes() == edited
+    (again,) = indices_of(tmp_path, overwrite=True)
+    assert (again.problem, report.path.read_bytes() == edited) == ("", False)
 
 
 def test_the_output_folder_of_another_run_takes_no_indices(tmp_path: Path) -> None:
