@@ -20,7 +20,7 @@ from agalign.values.residual import Residual
 from agalign.verify.checks import MAX_ALIAS_PEAK
 
 _MAX_MOVED_PX = 16.0
-"""Maximum distance of a corner from that of the seed; larger ones contradict it."""
+"""Maximum distance of a corner from that of the seed, px of the reduced reference; larger ones contradict it."""
 
 
 def fitted_to_windows(band: BandCandidates) -> RefinedBand | None:
