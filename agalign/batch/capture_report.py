@@ -3,12 +3,11 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Literal
 
-from agalign.host.files import below_as_given
 from agalign.host.text import counted
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar
@@ -59,11 +58,6 @@ class CaptureReport:
     """Processing time in this run, s."""
     stages: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     """Processing time by (band, stage), s."""
-
-    def below(self, out: Path) -> "CaptureReport":
-        """Return the report of a worker, whose paths are absolute, with paths below a folder as it was given."""
-        removed = tuple((below_as_given(path, out), reason) for path, reason in self.removed)
-        return replace(self, path=None if self.path is None else below_as_given(self.path, out), removed=removed)
 
     @property
     def sidecar(self) -> Sidecar | None:

@@ -11,7 +11,7 @@ import cv2
 from agalign.batch.capture_task import quiet
 from agalign.batch.workers import failure_text, numbers_of_workers, open_workers, serially
 from agalign.errors import AgalignError, ConfigurationError, SidecarError
-from agalign.host.files import REPORT_FILE, RUN_FILE, written_below
+from agalign.host.files import REPORT_FILE, RUN_FILE, below_as_given, written_below
 from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.processes import cores_for
 from agalign.records.captures import bands_of
@@ -111,7 +111,7 @@ def run_indices(
             sent = tasks if run_tasks is serially else [task.absolute() for task in tasks]
             for number, result in run_tasks(do_indices, sent):
                 try:
-                    reports = [report.below(tasks[number].target) for report in result()]
+                    reports = [_below(report, tasks[number].target) for report in result()]
                 except Exception as error:
                     reports = _failed(tasks[number], failure_text(error))
                 rows += reports
@@ -150,6 +150,11 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
     except AgalignError as error:
         reports = _failed(task, str(error))
     return [report.of(sidecar) for report in reports]
+
+
+def _below(report: IndexReport, folder: Path) -> IndexReport:
+    """Return the report of a worker, whose path is absolute, with its path below a folder as it was given."""
+    return report if report.path is None else replace(report, path=below_as_given(report.path, folder))
 
 
 def _failed(task: IndexTask, problem: str) -> list[IndexReport]:

@@ -29,7 +29,7 @@ from agalign.flight.panel_readings import PanelReading
 from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
-from agalign.host.files import MODELS_FOLDER, check_inside, path_problem, written_below
+from agalign.host.files import MODELS_FOLDER, below_as_given, check_inside, path_problem, written_below
 from agalign.host.output_folder import is_full, locked
 from agalign.host.own_files import refuse_foreign
 from agalign.host.processes import cores_for
@@ -501,7 +501,7 @@ def capture_reports(
     if run_tasks is not serially:
         for number, result in run_tasks(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
             try:
-                report = result().below(tasks[number].out)
+                report = _below(result(), tasks[number].out)
             except Exception as error:
                 report = CaptureReport(tasks[number].capture.label, "error", error=failure_text(error, timeout_s))
             yield report
@@ -511,6 +511,12 @@ def capture_reports(
             for following in tasks[number : number + 1]:
                 reader.submit(_read_ahead, following.capture)
             yield do_capture(task, partial(listener.on_pair, task.capture))
+
+
+def _below(report: CaptureReport, out: Path) -> CaptureReport:
+    """Return the report of a worker, whose paths are absolute, with paths below the output folder as it was given."""
+    removed = tuple((below_as_given(path, out), reason) for path, reason in report.removed)
+    return replace(report, path=None if report.path is None else below_as_given(report.path, out), removed=removed)
 
 
 def _read_ahead(capture: Capture) -> None:

@@ -19,7 +19,6 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.flight.fingerprint import hashed
-from agalign.host.files import below_as_given
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
@@ -139,10 +138,6 @@ class IndexReport:
         """Identify the row in the table: (folder, capture, index)."""
         label = PurePosixPath(self.capture)
         return label.parent.as_posix(), label.name, self.index
-
-    def below(self, folder: Path) -> "IndexReport":
-        """Return the report of a worker, whose path is absolute, with its path below a folder as it was given."""
-        return self if self.path is None else replace(self, path=below_as_given(self.path, folder))
 
     def of(self, sidecar: Sidecar) -> "IndexReport":
         """Return the report with the time and the position of its capture."""
@@ -297,7 +292,7 @@ def write_rasters(
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and (file := _foreign_file(target)):
                     raise InputError(foreign(file, "folder"))
-                if not overwrite and (change := listed.problem(target)) and IndexRaster.read(target) is not None:
+                if not overwrite and (change := listed.problem(target)) and IndexRaster.complete(target) is not None:
                     raise InputError(f"{change}; --overwrite replaces it")
                 statistics = earlier or _write(index, chosen, target, source, reader, samples)
             except (InputError, OutputError) as error:
@@ -335,6 +330,14 @@ class IndexRaster:
         tags = tags_of(path)
         statistics = _statistics_in(tags)
         return None if statistics is None else cls(path, statistics, tags)
+
+    @classmethod
+    def complete(cls, path: Path) -> Self | None:
+        """Return the index raster in a file that is not damaged; None for any other file."""
+        with suppress(OSError):
+            geotiff.check_complete(path)
+            return cls.read(path)
+        return None
 
     @property
     def name(self) -> str:
@@ -411,11 +414,8 @@ def _finished_before(target: Path, source: str, listed: ListedFiles) -> IndexSta
     picture = target.with_suffix(".png")
     if not picture.is_file() or any(map(listed.problem, (target, picture))):
         return None
-    with suppress(OSError):
-        geotiff.check_complete(target)
-        raster = IndexRaster.read(target)
-        return raster.statistics if raster is not None and raster.tags.get("INDEX_MADE_FROM") == source else None
-    return None
+    raster = IndexRaster.complete(target)
+    return raster.statistics if raster is not None and raster.tags.get("INDEX_MADE_FROM") == source else None
 
 
 def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader) -> str:

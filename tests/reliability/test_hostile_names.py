@@ -61,7 +61,7 @@ def hostile_run(flight: Path, shared: Shared) -> Path:
         settings = seeded("rig", layout="both", ground_elevation_m=0.0, **write)
         reports = agalign.align_folder(folder / "in", folder / "deep" / "er" / "out", settings=settings)
         assert [r.error for r in reports] == [None] * len(HOSTILE)
-        for path in find_sidecars(folder / "deep"):
+        for path in find_sidecars(folder / "deep" / "er" / "out"):
             content = path.read_text().replace('"degraded"', '"ok"').replace('"seed_only"', '"aligned"')
             write_signed(path, content)
 
