@@ -322,7 +322,8 @@ class _Estimate:
         max_rounds = 3
         for _ in range(max_rounds):
             low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
-            matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
+            grey, is_known = group[0].pair.reference.grey, layout is not None
+            matching = DenseMatching(grey, _views(bands), (low, high), is_sign_known=is_known)
             matched = matching.matched(range(len(bands)))
             # The parallax of the windows is free: noise of the relief would otherwise shorten the baselines.
             windows = _window_shifts(bands, matched, with_lens_shapes=lens_std is not None)

@@ -80,9 +80,19 @@ class View:
 class DenseMatching:
     """Matching costs of all bands of one capture, from which the relief of any selection of bands is computed."""
 
-    def __init__(self, reference: Raster, views: Sequence[View], window_range_px: tuple[float, float]) -> None:
-        """Compute the costs; `reference` has one channel, `window_range_px` is the parallax range of the windows."""
-        self.reference, self.views = reference, views
+    def __init__(
+        self,
+        reference: Raster,
+        views: Sequence[View],
+        window_range_px: tuple[float, float],
+        *,
+        is_sign_known: bool = True,
+    ) -> None:
+        """Compute the costs; `reference` has one channel, `window_range_px` is the parallax range of the windows.
+
+        With `is_sign_known`, positive parallax is nearer to the camera; else either may be.
+        """
+        self.reference, self.views, self.is_sign_known = reference, views, is_sign_known
         self.scale = min(1.0, (MAX_MATCHED_PX / reference.valid.size) ** 0.5)
         low, high = self._range_px(window_range_px)
         # The time is proportional to the number of levels.
@@ -111,7 +121,7 @@ class DenseMatching:
     def refined(self, views: Sequence[View], selections: Sequence[Sequence[int]]) -> list[Relief]:
         """Return the relief of each selection of bands at full resolution, with refitted views.
 
-        A relief depends only on the selected bands, so that it can be verified with the others.
+        A relief depends only on the selected bands, but for its range, so that it can be verified with the others.
         """
         margin = 2 * self.step_px
         limits = self.levels_px[0] - margin, self.levels_px[-1] + margin
@@ -136,7 +146,8 @@ class DenseMatching:
     def _range_px(self, windows_px: tuple[float, float]) -> tuple[float, float]:
         """Return the range of parallax in the windows and the wide search."""
         longer_side_px = max(self.reference.size_px)
-        low = min(-_SEARCH_FARTHER * longer_side_px, windows_px[0])
+        farther = _SEARCH_FARTHER if self.is_sign_known else _SEARCH_NEARER
+        low = min(-farther * longer_side_px, windows_px[0])
         high = max(_SEARCH_NEARER * longer_side_px, windows_px[1])
         levels = np.arange(low, high + _SEARCH_STEP_PX, _SEARCH_STEP_PX)
         relative_scale = 0.25  # of the wide search

@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 Captures = Sequence[CaptureFactors]
 Basis = Literal["flight", "seconds", "altitude_m"]
 """What a band is predicted from: the mean of the flight, or its variation over time or altitude."""
+_MAX_GAP_RATIO = 2.0
+"""An estimate is validated on captures with at most this ratio to its gap."""
 
 
 def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
@@ -49,7 +51,10 @@ def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> float:
     known, or from the flight's mean.
     """
     squares = [square for _, square in _leave_one_out(rig, band, "seconds" if by_neighbours else "flight")]
-    return math.sqrt(float(np.mean(squares)) + rig.from_bands_px[band] ** 2) if squares else math.nan
+    if not squares:
+        return math.nan
+    mean_px2 = float(expected_square(np.mean(squares), len(squares)))
+    return math.sqrt(mean_px2 + rig.from_bands_px[band] ** 2)
 
 
 def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
@@ -138,7 +143,9 @@ def estimated_factors(
     """Return factors (5,), their standard error (5,), and the gap to the nearest capture used; None if unknown.
 
     They are the flight's mean, or linearly interpolated in time, with the standard deviation of the two captures,
-    weighted by their shares. With `altitude_m` the distance is interpolated over the altitude, the others in time.
+    weighted by their shares; before the first and after the last capture, those of this one, with the change that the
+    nearest two predict as standard error. With `altitude_m` the distance is interpolated over the altitude, and the
+    others in time, if the capture is not far in time.
     """
     moved, mean = _at_motion(others, capture.motion)
     if basis == "flight":
@@ -151,9 +158,15 @@ def estimated_factors(
     place = float(np.interp(position, x, np.arange(len(x))))
     start, end, share = factors[int(place)], factors[min(int(place) + 1, len(x) - 1)], place % 1
     result, std = start + share * (end - start), np.abs(end - start) * np.sqrt(share * (1 - share))
+    gap = float(np.abs(x - position).min())
+    if len(x) > 1 and not x[0] <= position <= x[-1]:
+        first, second = (0, 1) if position < x[0] else (-2, -1)
+        std = np.abs(factors[second] - factors[first]) * gap / max(x[second] - x[first], 1e-9)
     if basis == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
-        result[1:], std[1:] = in_time[0][1:], in_time[1][1:]
-    return result, std, float(np.abs(x - position).min())
+        times_s = sorted(c.seconds for c in others if c.seconds is not None)
+        is_near = in_time[2] <= _MAX_GAP_RATIO * max(np.diff(times_s), default=0.0)
+        result[1:], std[1:] = (in_time[0][1:], in_time[1][1:]) if is_near else (mean[1:], 0.0)
+    return result, std, gap
 
 
 def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[Captures, Array]:
@@ -182,13 +195,12 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Pre
     flight's mean remains.
     """
     min_for_altitude = 6  # with fewer captures, the basis with the smallest error would be selected by chance
-    max_gap_ratio = 2.0  # an estimate is validated on captures with at most this ratio to its gap
     design, results = rig.design(band), []
     for basis in get_args(Basis)[: 3 if len(rig.captures) >= min_for_altitude else 2]:
         estimate, tests = estimated_factors(known, rig.captures, basis), _leave_one_out(rig, band, basis)
-        if estimate is not None and tests and estimate[2] <= max_gap_ratio * tests[-1][0]:
+        if estimate is not None and tests and estimate[2] <= _MAX_GAP_RATIO * tests[-1][0]:
             factors, std, gap = estimate
-            similar = [square for other_gap, square in tests if other_gap <= max_gap_ratio * gap]
+            similar = [square for other_gap, square in tests if other_gap <= _MAX_GAP_RATIO * gap]
             squares = similar if len(similar) >= MIN_CAPTURES else [square for _, square in tests[:MIN_CAPTURES]]
             mean_px2 = float(expected_square(np.mean(squares), len(squares)))
             source: PredictionSource = "neighbours" if basis != "flight" and (design @ factors).any() else "flight"

@@ -53,6 +53,17 @@ def check(relief: Relief, area: tuple[slice, slice] = BOX, near_px: int = 12) ->
     assert np.mean(np.abs(z[outside]) < 1) > 0.95
 
 
+@pytest.mark.parametrize("is_sign_known", [True, False])
+def test_a_near_surface_is_found_with_either_sign_of_the_baselines(is_sign_known: bool) -> None:
+    """Without tags the sign is arbitrary; far behind the ground there is nothing."""
+    near_px = 18  # 5.6 % of the width
+    seen, matching = scene_of(BASELINES, near_px=near_px)
+    opposite = [replace(view, baseline=(-view.baseline[0], -view.baseline[1])) for view in seen]
+    again = DenseMatching(matching.reference, opposite, (-1.0, 1.0), is_sign_known=is_sign_known)
+    assert (again.levels_px[0] <= -near_px) is not is_sign_known
+    assert again.levels_px[-1] < near_px
+
+
 def test_a_box_in_front_of_the_ground() -> None:
     seen, matching = scene_of(BASELINES)
     check(matching.matched(range(4)))
