@@ -206,7 +206,7 @@ def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPa
         file=context.paths.relative(stack[0].path) if stack else None,
         bands=[layer.band.name for layer in context.layers],
         radiometry=" and ".join(dict.fromkeys(f"{part.quantity} by {part.source}" for part in bands)) or None,
-        panel_age_s=next((r.panel_age_s for r in radiometry.values() if r.panel_age_s is not None), None),
+        panel_age_s=max((r.panel_age_s for r in radiometry.values() if r.panel_age_s is not None), default=None),
         illumination=[
             IlluminationPart(band=name, irradiance=r.irradiance, reflectance_per_radiance=r.factor)
             for name, r in radiometry.items()

@@ -79,8 +79,9 @@ def _horizontal(tags: Tags, elevation: float | None) -> Irradiance | None:
     calculates only the components correctly: these are used where they contradict it.
     """
     tag, direct, diffuse = (_positive(tags, f"{name}Irradiance") for name in ("Horizontal", "Direct", "Scattered"))
-    has_components = elevation is not None and direct is not None and diffuse is not None
-    calculated = direct * math.sin(elevation) + diffuse if has_components and elevation and direct and diffuse else None
+    calculated = None
+    if elevation is not None and elevation > 0 and direct is not None and diffuse is not None:
+        calculated = direct * math.sin(elevation) + diffuse
     known = [v for v in (tag, calculated) if v is not None]
     if not known:
         return None
@@ -122,7 +123,7 @@ def _in_plane_of_sensor(tags: Tags, sun: tuple[float, float] | None) -> Irradian
         return Irradiance(value * scale, (LIGHT_SENSOR[1], REPEATABILITY, NO_TILT))
     horizontal = horizontal_irradiance(value, attitude_deg, sun)
     if math.isnan(horizontal):
-        return Irradiance()
+        return Irradiance(problem="the light sensor points too far from the sun, or the sun is below the horizon")
     return Irradiance(horizontal * scale, (LIGHT_SENSOR[1], REPEATABILITY, tilt_error(horizontal / value)))
 
 

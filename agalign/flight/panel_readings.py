@@ -255,7 +255,6 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
     timed = _within_hours(of_camera, capture)
     near = timed or _without_clock(of_camera, capture)
     used = [(s, r) for s, r in near if r.is_used]
-    age_s = min((abs(later_s) for later_s, r in timed if r.is_used), default=None)
     fits_sensor, result = all(r.fits_sensor for _, r in used), {}
     for band in capture.bands:
         samples = [(s, b) for s, r in used for b in r.bands if b.band.name == band.name]
@@ -263,15 +262,17 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
         light = [(s, 1 / b.factor) for s, b in samples if b.factor]
         sun = None if band.radiometry is None else band.radiometry.by_sun
         contradictions = _contradictions([r for _, r in near], band.name)
-        measured = [b for _, b in samples if b.factor]
+        measured = sorted((abs(s), b.spread) for s, b in samples if b.factor)
+        nearest_s, spread = measured[0] if measured else (0.0, 0.0)
+        age_s = nearest_s if timed and measured else None
         if sun and scales and fits_sensor:
             source: RadiometrySource = "panel and light sensor"
             value = sun.value / _interpolated(scales)
             tilt = [e for e in sun.errors if e not in LIGHT_SENSOR.values()]  # its scale is that of the panel
-            errors = (*panel_errors(measured[0].spread, None), *_difference(scales), *tilt)
+            errors = (*panel_errors(spread, None), *_difference(scales), *tilt)
         elif light:
             value, source = 1 / _interpolated(light), "panel"
-            errors = (*panel_errors(measured[0].spread, age_s), *_difference(light))
+            errors = (*panel_errors(spread, age_s), *_difference(light))
         else:
             continue
         result[band.name] = ReflectanceFactor(value, "reflectance", source, age_s, (*errors, *contradictions))

@@ -60,7 +60,7 @@ class ReliefView(NamedTuple):
     parallax_px: NDArray[np.float32]
     """(height, width)"""
     range_m: tuple[float, float] | None
-    """Smallest and largest range; None if it is unknown."""
+    """1st and 99th percentile of the range; None if it is unknown."""
 
 
 class Preview(Product):

@@ -1,14 +1,18 @@
 """Cameras: which of them recognises a file, its lenses, and what its rig tags mean."""
 
 import math
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
 from rasterio.enums import ColorInterp
 
+from agalign.cameras import dls, read_files
 from agalign.cameras.base import default_reference
+from agalign.cameras.discover import discover
 from agalign.cameras.dls import horizontal_irradiance, transmission
 from agalign.cameras.generic import Generic
 from agalign.cameras.makers import known_cameras
@@ -201,3 +205,38 @@ def test_a_horizontal_irradiance_that_contradicts_its_components_is_replaced(
     tags = {"HorizontalIrradiance": horizontal * error, "DirectIrradiance": 120.0, "ScatteredIrradiance": 15.0}
     assert irradiance(path, tags) == pytest.approx(horizontal / 100 * expected)
     assert irradiance(path, tags, position=None) == pytest.approx(horizontal / 100 * error)
+
+
+@pytest.mark.parametrize(
+    ("values", "is_used"),
+    [
+        # Of a DLS 2, whose clock is wrong by half a day, and of a DLS 1.
+        ({"Direct": 110.0, "Scattered": 20.0, "Horizontal": 100.0, "Spectral": 100.0}, True),
+        ({"Spectral": 1.0}, False),
+    ],
+)
+def test_a_sun_below_the_horizon_is_no_error_of_the_program(values: dict[str, float], is_used: bool) -> None:
+    xmp = {(dls.NAMESPACE, f"{name}Irradiance"): (str(value),) for name, value in values.items()}
+    xmp |= {(dls.NAMESPACE, name): ("0.0",) for name in ("Yaw", "Pitch", "Roll")}
+    night = Tags(size_px=(64, 48), xmp=xmp, position=GOLDEN, captured_at="2026-06-21T07:00:00Z")
+    result = dls.irradiance(night)
+    assert (result.value > 0) is is_used
+    assert ("the sun is below the horizon" in result.problem) is not is_used
+
+
+def test_a_file_whose_tags_raise_an_error_does_not_cost_the_others(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(flight, tmp_path / "flight"))
+    read = read_files.read_file
+
+    def failing(path: Path, *rest: Any) -> Any:
+        if path.name == "IMG_0001_4.tif":
+            raise ValueError("math domain error")
+        return read(path, *rest)
+
+    monkeypatch.setattr(read_files, "read_file", failing)
+    scan = discover(folder)
+    (problem,) = scan.problems
+    assert "IMG_0001_4.tif: its tags cannot be used (ValueError: math domain error); leave it out" in problem.text
+    assert [len(c.bands) for c in scan.captures] == [4, 5]

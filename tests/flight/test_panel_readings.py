@@ -104,6 +104,20 @@ def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     assert reflectance_factors(replace(capture(GREEN), camera=CameraIdentity("a", "b", "2")), panels) == {}
 
 
+def test_the_age_of_a_panel_is_that_of_the_nearest_one_with_the_band() -> None:
+    """The NIR of the panel at noon is saturated: its factor, and how old this is, are those of the panel before."""
+    nir = replace(GREEN, name="NIR")
+    shown = [replace(capture(GREEN, f"2026-06-21T{hour}:00:00"), bands=(GREEN, nir)) for hour in (10, 12)]
+    of_green, of_nir = BandReading(GREEN, 0.5, 0.25), BandReading(nir, 0.5, 0.25)
+    lost = BandReading(nir, 0.5, 0.25, "5% of it is saturated")
+    panels = [PanelReading(shown[0], (of_green, of_nir)), PanelReading(shown[1], (of_green, lost))]
+    later = replace(capture(GREEN, "2026-06-21T11:55:00"), bands=(GREEN, nir))
+    result = reflectance_factors(later, panels)
+    assert {name: factor.panel_age_s for name, factor in result.items()} == {"Green": 300, "NIR": 6900}
+    light = {name: max(e.std_percent for e in factor.errors) for name, factor in result.items()}
+    assert light["NIR"] > 5 * light["Green"]
+
+
 def facts(factors: dict[str, ReflectanceFactor]) -> dict[str, tuple[float, str, float | None]]:
     """(value, source, age of the panel in s) by band."""
     return {name: (f.value, f.source, f.panel_age_s) for name, f in factors.items()}
