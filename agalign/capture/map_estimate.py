@@ -31,6 +31,9 @@ from agalign.values.geometry import Matrix
 from agalign.values.least_squares import Robust, least_squares
 from agalign.values.residual import Residual
 
+_MAX_CORRECTION_PX = 1.0
+"""Of a corner, by windows; larger ones contradict the mapping."""
+
 
 def with_map_estimates(
     bands: Sequence[RefinedBand], rig: Rig | None, capture: Capture | None = None
@@ -40,13 +43,12 @@ def with_map_estimates(
     The windows of a band are ignored, also without a fold, if all together are too few or their correction is too
     large. Bands without any information have their result.
     """
-    max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
     residuals = [band.warped.residual for band in bands]
     sides_px = [band.warped.windows.side for band in bands]
     parts = (remaining(r, chessboard(r), side_px) for r, side_px in zip(residuals, sides_px, strict=True))
     without_fold = zip(*parts, strict=True)
     fits, *by_fold = ([_fit(b, r) for b, r in zip(bands, some, strict=True)] for some in (residuals, *without_fold))
-    is_used = [fit is not None and fit.max_px <= max_correction_px for fit in fits]
+    is_used = [fit is not None and fit.max_px <= _MAX_CORRECTION_PX for fit in fits]
     estimates, *without = (
         _estimates(bands, [fit if used else None for fit, used in zip(some, is_used, strict=True)], rig, capture)
         for some in (fits, *by_fold)

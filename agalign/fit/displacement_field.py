@@ -40,6 +40,8 @@ determine the field of the others."""
 _SMOOTHNESS = 0.4
 """Weight of the second differences of a field, relative to such a window: their prior has a standard deviation of
 _NOISE_PX / sqrt(_SMOOTHNESS) = 0.19 px. With 2, errors at ties are a sixth larger on three scenes."""
+_DAMPING = 0.003
+"""Weight of the field itself, relative to such a window: it vanishes far from all windows."""
 _MAX_P95_GROWTH = 1.05
 """Maximum ratio of the p95 of held-out windows with a field to that without it, as the p95 is noisy. No significance is
 required: held-out windows are predicted without those near them, less accurately than by the complete field, which
@@ -227,8 +229,7 @@ def fitted_field(
     order = np.argsort(size_px, kind="stable")
     nodes, bilinear = _interpolation(shifts.centres_px[:, order] / lattice_px, columns, rows)
     penalty = smoothness * _second_difference_form(columns, rows)
-    damping = 0.003  # relative to one window
-    penalty[0] += damping
+    penalty[0] += _DAMPING
     first, second = np.triu_indices(len(nodes))
     elements = (nodes[second] - nodes[first]) * (rows * columns) + nodes[first]
     products = bilinear[first] * bilinear[second]

@@ -42,6 +42,8 @@ MAX_ALIAS_PEAK = 0.75
 
 _MIN_COMMON_COVERAGE = 0.3
 """Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
+_MIN_WINDOWS = 5
+"""Minimum number of measured windows: some homography fits the two coordinates of any four."""
 _MIN_VERIFYING_WINDOWS = 12
 """Held-out windows with a measured shift that verify a result without descriptors: in unrelated images, one in a
 thousand is aligned."""
@@ -102,10 +104,10 @@ def _descriptor_issues(joint: JointResult | None, residual: Residual) -> Iterato
 
 def _window_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
     """Residual shifts of windows, each without its own part in the estimation."""
-    measured, min_windows = len(residual.measured_px), 5  # some homography fits the two coordinates of any four
+    measured = len(residual.measured_px)
     is_covered = residual.coverage >= _MIN_COMMON_COVERAGE
-    if measured < min_windows and (is_covered or len(residual.centres_px) < min_windows):
-        yield Issue(FEW_WINDOWS, measured, min_windows)
+    if measured < _MIN_WINDOWS and (is_covered or len(residual.centres_px) < _MIN_WINDOWS):
+        yield Issue(FEW_WINDOWS, measured, _MIN_WINDOWS)
         return
     if not is_covered:
         yield Issue(COVERAGE, residual.coverage, _MIN_COMMON_COVERAGE)
