@@ -137,7 +137,12 @@ def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[str, GridVig
 
 
 def _correction(band: Band) -> Radiometry | None:
-    """The correction of a band's vignetting by its tags."""
+    """The correction of a band's vignetting: that of its calibration, which is of the image as it is, also if a program
+    resized it; without a calibration by the tags of the file.
+    """
+    known = band.radiometry
+    if known is not None and any(known.vignetting) and known.vignetting_divides:
+        return replace(known, quantity="relative radiance", full_scale=1.0, gain=1.0, row_gradient=0.0)
     with suppress(UnreadableFileError):
         return vignetting_of(read_tags(band.path, band.page), band.size_px)
     return None

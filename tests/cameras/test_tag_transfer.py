@@ -11,6 +11,7 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 from agalign.cameras.base import Camera
+from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
@@ -28,6 +29,7 @@ from agalign.cameras.tiff_directory import (
     text,
 )
 from agalign.pixels.raster import probe
+from agalign.rasters.aligned_files import _correction
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
@@ -209,3 +211,16 @@ def test_only_dates_of_a_clock_that_was_not_set_are_removed(original: str, digit
     times = {Base.DateTimeOriginal: text(original), Base.DateTimeDigitized: text(digitised)}
     directory = {**times, Base.SubsecTimeOriginal: text("25"), Base.FNumber: text("2")}
     assert set(_without_unset_clock(directory)) == kept | {Base.FNumber}
+
+
+def test_the_vignetting_of_a_resized_image_is_that_of_its_calibration(flight: Path) -> None:
+    band, half = discover(flight).captures[0].bands[0], PixelScale(0.5, 0.5)
+    by_file = vignetting_of(read_tags(band.path), band.size_px)
+    assert any(by_file.vignetting)
+    small = replace(band, width_px=band.width_px // 2, height_px=band.height_px // 2)
+    small = replace(small, radiometry=band.radiometry.rescaled(half))
+    for one, expected in ((band, by_file), (small, by_file.rescaled(half))):
+        correction = _correction(one)
+        assert correction.vignetting == pytest.approx(expected.vignetting)
+        assert correction.vignetting_centre_px == pytest.approx(expected.vignetting_centre_px)
+        assert (correction.black_level, correction.gain) == (by_file.black_level, 1.0)
