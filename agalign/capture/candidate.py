@@ -43,7 +43,8 @@ class Candidate:
     other_residual: Residual | None = None
     """More windows, which also have to pass the checks: with a displacement field, those of the homography's fit."""
     held_out_p95_px: Mapping[Geometry, float] = field(default_factory=dict)
-    """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
+    """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was. That of a
+    field on a relief is under the relief of all bands."""
     refined_from: "Candidate | None" = None
     """The candidate that it refines."""
     given_issues: tuple[Issue, ...] | None = None
