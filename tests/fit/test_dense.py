@@ -60,7 +60,7 @@ def test_a_near_surface_is_found_with_either_sign_of_the_baselines(is_sign_known
     seen, matching = scene_of(BASELINES, near_px=near_px)
     opposite = [replace(view, baseline=(-view.baseline[0], -view.baseline[1])) for view in seen]
     again = DenseMatching(matching.reference, opposite, (-1.0, 1.0), is_sign_known=is_sign_known)
-    assert (again.levels_px[0] <= -near_px) is not is_sign_known
+    assert bool(again.levels_px[0] <= -near_px) is (not is_sign_known)
     assert again.levels_px[-1] < near_px
 
 
