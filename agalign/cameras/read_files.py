@@ -228,6 +228,8 @@ def _read_task(paths: Iterable[Path], options: DiscoverOptions) -> list[ImageFil
             result.append(read_file(path, cameras, options))
         except UnreadableFileError as error:
             result.append(Problem(path, error))
+        except MemoryError:  # no fault of the file
+            raise
         except Exception as error:  # tags may have any values, and one file must not end the run
             what = f"{path}: its tags cannot be used ({shortened(f'{type(error).__name__}: {error}')})"
             result.append(Problem(path, UnreadableFileError(what, "leave it out with --exclude, and report this")))

@@ -73,7 +73,7 @@ def export(out: Path, target: Path, program: ExportProgram, *, copy: bool = Fals
     The captures have the same bands and quantities as most. Files are hard links if the file system allows that, and
     copies otherwise or with `copy`.
     Raises InputError if there is no run or nothing to export, ConfigurationError if the run wrote no band files,
-    OutputError if `target` is not empty, cannot be written, or is no local folder.
+    OutputError if `target` is not empty, is an address, or cannot be written.
     """
     if problem := path_problem(target):
         raise OutputError(problem)

@@ -145,7 +145,7 @@ def estimated_factors(
     They are the flight's mean, or linearly interpolated in time, with the standard deviation of the two captures,
     weighted by their shares; before the first and after the last capture, those of this one, with the change that the
     nearest two predict as standard error. With `altitude_m` the distance is interpolated over the altitude, and the
-    others in time, if the capture is not far in time.
+    others in time; of a capture far in time these are the flight's mean, with their spread as standard error.
     """
     moved, mean = _at_motion(others, capture.motion)
     if basis == "flight":
@@ -165,7 +165,8 @@ def estimated_factors(
     if basis == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
         times_s = sorted(c.seconds for c in others if c.seconds is not None)
         is_near = in_time[2] <= _MAX_GAP_RATIO * max(np.diff(times_s), default=0.0)
-        result[1:], std[1:] = (in_time[0][1:], in_time[1][1:]) if is_near else (mean[1:], 0.0)
+        spread = np.sqrt(np.square(factors - mean).mean(axis=0))
+        result[1:], std[1:] = (in_time[0][1:], in_time[1][1:]) if is_near else (mean[1:], spread[1:])
     return result, std, gap
 
 

@@ -357,12 +357,16 @@ class IndexRaster:
         return None
 
     def is_of_other(self, bands: Path, samples: Collection[str]) -> bool:
-        """Return True if this raster and a file of bands are of different captures: by the ids in their tags, or by the
-        `samples` of the input of the bands if one of them has no id.
+        """Return True if this raster and a file of bands are of different captures: by the ids in their tags; if one of
+        them has no id, by the `samples` of the input of the bands, or by camera and time if one has no samples.
         """
-        ids = self.tags.get("CAPTURE_ID"), tags_of(bands).get("CAPTURE_ID")
-        own = self.tags.get(_SAMPLES_TAG, "").split()
-        return ids[0] != ids[1] if all(ids) else bool(own and samples) and set(own).isdisjoint(samples)
+        own, others = self.tags, tags_of(bands)
+        known = [name for name in _OF_CAPTURE if own.get(name) and others.get(name)]
+        own_samples = own.get(_SAMPLES_TAG, "").split()
+        if "CAPTURE_ID" not in known and own_samples and samples:
+            return set(own_samples).isdisjoint(samples)
+        decisive = known[:1] if "CAPTURE_ID" in known else known
+        return any(own[name] != others[name] for name in decisive)
 
     @property
     def is_masked(self) -> bool:

@@ -174,9 +174,10 @@ def test_factors_are_not_those_of_captures_far_in_time_at_the_same_altitude() ->
     captures = [CaptureFactors(60.0 * k, 100.0 + k, None, (0.1 * k, 0.0, 0.0, 1.0, 1.0)) for k in range(8)]
     mean = np.zeros(5)
     for seconds, is_mean in ((540.0, False), (86_400.0, True)):
-        factors, *_ = estimated_factors(Observation(seconds, {}, {}, 103.0), captures, "altitude_m")
+        factors, std, _ = estimated_factors(Observation(seconds, {}, {}, 103.0), captures, "altitude_m")
         assert factors[0] == pytest.approx(0.3)
         assert np.array_equal(factors[1:], mean[1:]) is is_mean
+        assert std[3:].tolist() == ([1.0, 1.0] if is_mean else [0.0, 0.0])  # all of them differ from the mean by 1
 
 
 def test_altitudes_that_hardly_differ_determine_no_slope() -> None:

@@ -303,15 +303,18 @@ def test_the_exit_code_is_3_for_files_that_the_pages_lack(tmp_path: Path) -> Non
         assert ("IMG_0001.preview.jpg: is not what was written" in done.stderr, done.returncode) == (code == 3, code)
 
 
+@pytest.mark.parametrize("has_samples", [True, False])
 @pytest.mark.parametrize("ids", [("a", "b"), ("a", ""), ("", "")])
-def test_indices_of_another_flight_are_not_replaced(tmp_path: Path, ids: tuple[str, str]) -> None:
+def test_indices_of_another_flight_are_not_replaced(tmp_path: Path, ids: tuple[str, str], has_samples: bool) -> None:
     """Cameras give the captures of each flight the same names, and tags may be lost."""
     for flight, capture_id in zip(("one", "two"), ids, strict=True):
         make_aligned(tmp_path / flight, 1)
         path = tmp_path / flight / "0000SET" / "IMG_0001.json"
         with rasterio.open(path.with_suffix(".tif"), "r+") as stack:
-            stack.update_tags(CAPTURE_ID=capture_id)
-        list_stack(path, read_sidecar(path).model_copy(update={"input_samples": {"NIR": f"sample of {flight}"[-3:]}}))
+            time = {} if has_samples else {"TIFFTAG_DATETIME": f"2026:06:21 10:00:0{int(flight == 'two')}"}
+            stack.update_tags(CAPTURE_ID=capture_id, **time)
+        samples = {"NIR": f"sample-of-{flight}"} if has_samples else {}
+        list_stack(path, read_sidecar(path).model_copy(update={"input_samples": samples}))
     target = tmp_path / "indices"
     (report,) = indices_of(tmp_path / "one", target=target)
     before = report.path.read_bytes()
