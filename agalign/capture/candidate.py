@@ -41,7 +41,8 @@ class Candidate:
     images: WarpedPair | None = None
     """The images under the mapping, with the relief of other bands if it has one; None omits checks that use pixels."""
     other_residual: Residual | None = None
-    """More windows, which also have to pass the checks: with a displacement field, those of the homography's fit."""
+    """More windows, which also have to pass the checks: with a displacement field, those of the homography's fit, or of
+    the images in which it was fitted."""
     held_out_p95_px: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was. That of a
     field on a relief is under the relief of all bands."""

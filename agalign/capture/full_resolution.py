@@ -16,7 +16,7 @@ from agalign.capture.candidate import Candidate, mapping_error
 from agalign.errors import UnreadableFileError
 from agalign.fit.held_out import chessboard
 from agalign.fit.window_fit import cross_fitted
-from agalign.fit.windows import FixedWindows
+from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import OpenRaster, open_raster, read_tile
@@ -54,7 +54,8 @@ def is_worth_refining(pair: BandPair, alignment: Alignment) -> bool:
 
 def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue | None:
     """Return the candidate that is fitted to tiles of the files, from one by the reduced images, whose displacement
-    field it has: windows of those images have verified it.
+    field it has. The field may be fitted to the pixels of the tiles, so the windows that it is not fitted to, in the
+    reduced images, have to pass the checks too.
 
     None if the tiles have too little structure, or if the shifts of held-out windows do not decrease. The issue
     UNREADABLE if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
@@ -84,7 +85,8 @@ def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue |
     joint = start.joint.with_homography(down.fixed_to_moving, fitted.fit.covariance_px2 * np.outer(factors, factors))
     held_out = fitted.held_out.rescaled(scale)
     error = mapping_error(pair, down, joint.covariance_px2, held_out)
-    refined = Candidate(pair, down, error, held_out, joint, refined_from=start)
+    of_field = None if down.field is None else residual_under(start.residual, start.mapping, down)
+    refined = Candidate(pair, down, error, held_out, joint, other_residual=of_field, refined_from=start)
     return refined.with_relief_std_px(start.error.relief_std_px)
 
 

@@ -153,6 +153,20 @@ def test_the_displacement_field_of_the_reduced_images_continues_by_chance_far_fr
     assert error.lens_std_px is None
 
 
+@pytest.mark.parametrize(
+    ("shift_px", "issues"), [((0.0, 0.0), set()), ((1.8, 0.0), {"inaccurate", "close_windows", "cluster"})]
+)
+def test_windows_that_the_displacement_field_is_not_fitted_to_verify_it_after_tiles_too(
+    capture: Capture, pair: BandPair, shift_px: tuple[float, float], issues: set[str]
+) -> None:
+    flat = on_reduced_images(pair)
+    bent = replace(flat, mapping=replace(flat.mapping, field=DisplacementField(50.0, np.zeros((9, 11, 2)))))
+    # The start is off by (1.2, -0.6) px of the files, by which the windows seem to be at rest.
+    start_px = np.array(bent.residual.shifts_px) + (-0.6, 0.3) + np.array(shift_px)
+    start = replace(bent, residual=bent.residual.with_shifts(start_px))
+    assert {issue.kind.code for issue in refined(capture, start).issues} == issues
+
+
 def test_areas_without_data_do_not_count_in_georeferenced_files(capture: Capture, pair: BandPair) -> None:
     image = pair.reference.image
     left = Reference(replace(image, valid=image.valid & (np.arange(HALF_PX[0]) < HALF_PX[0] // 2)))
