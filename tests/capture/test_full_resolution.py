@@ -162,7 +162,7 @@ def test_windows_that_the_displacement_field_is_not_fitted_to_verify_it_after_ti
     flat = on_reduced_images(pair)
     bent = replace(flat, mapping=replace(flat.mapping, field=DisplacementField(50.0, np.zeros((9, 11, 2)))))
     # The start is off by (1.2, -0.6) px of the files, by which the windows seem to be at rest.
-    start_px = np.array(bent.residual.shifts_px) + (-0.6, 0.3) + np.array(shift_px)
+    start_px = bent.residual.shifts_px + np.array([-0.6, 0.3]) + np.array(shift_px)
     start = replace(bent, residual=bent.residual.with_shifts(start_px))
     assert {issue.kind.code for issue in refined(capture, start).issues} == issues
 
