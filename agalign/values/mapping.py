@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from pydantic import Field
 from pydantic import dataclasses as validated
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, spline_filter
 
 from agalign.host.memory_limits import MAX_HELD_POSITIONS_PX
 from agalign.values import geometry, lens
@@ -30,6 +30,10 @@ _KNOT_STEP_PX = 32
 _CELL_PX = 32.0
 """Range of parallax over which a parabola replaces the mapping, to 0.001 px; the first range is around 0, so that it
 contains most scenes."""
+
+
+_PADDED_NODES = 12
+"""Copies of the nodes at the edge beyond it, for its splines: their influence decreases by a factor of 3.7 per node."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
@@ -59,10 +63,15 @@ class DisplacementField:
         """The displacement (..., 2) at points (..., 2), by cubic splines; outside the lattice that of its edge."""
         points = np.asarray(points_px)
         on_lattice = points if self.scale == SAME_PIXELS else self.scale.positions(points)
-        at = on_lattice.reshape(-1, 2)[:, ::-1].T / self.step_px
-        planes = np.moveaxis(self.displacements_px, -1, 0)
-        values = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
+        at = on_lattice.reshape(-1, 2)[:, ::-1].T / self.step_px + _PADDED_NODES
+        values = [map_coordinates(c, at, order=3, mode="nearest", prefilter=False) for c in self._coefficients]
         return self.scale.inverse.displacements(np.stack(values, axis=-1).reshape(points.shape))
+
+    @cached_property
+    def _coefficients(self) -> list[NDArray[np.float64]]:
+        """Those of the splines, along x and y, with padding: once for all blocks of an image."""
+        planes = (np.pad(plane, _PADDED_NODES, mode="edge") for plane in np.moveaxis(self.displacements_px, -1, 0))
+        return [spline_filter(plane, order=3, mode="nearest") for plane in planes]
 
     def rescaled(self, scale: PixelScale) -> "DisplacementField":
         """The same on an image that is resized by `scale`."""

@@ -5,6 +5,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from agalign.errors import InputError
 from agalign.synthetic import cameras
@@ -85,6 +86,15 @@ def test_the_displacements_of_lenses_and_the_parallax_add_up_before_the_homograp
     for each, expected in ((mapping, plane + 12 * np.array(BASELINE)), (mapping.without_parallax, plane)):
         np.testing.assert_allclose(each(edge), lens.distort(MOVING, geometry.apply(H, expected)), atol=1e-6)
     assert mapping.without_parallax.parallax is None
+
+
+def test_a_displacement_field_is_that_of_cubic_splines_and_beyond_the_image_that_of_the_edge() -> None:
+    nodes = FIELD.displacements_px
+    points = np.random.default_rng(1).uniform((-60, -60), (SIZE[0] + 200, SIZE[1] + 200), (500, 2))
+    rows_columns = points[:, ::-1].T / FIELD.step_px
+    expected = [map_coordinates(plane, rows_columns, order=3, mode="nearest") for plane in np.moveaxis(nodes, -1, 0)]
+    np.testing.assert_array_equal(FIELD(points), np.transpose(expected))
+    np.testing.assert_allclose(FIELD(np.array([[96.0, 48.0], [-5000.0, 48.0]])), nodes[1, [2, 0]], atol=1e-5)
 
 
 @pytest.mark.parametrize(
