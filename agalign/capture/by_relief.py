@@ -33,8 +33,10 @@ from agalign.fit.window_fit import (
     are_of_lenses,
     are_on_a_line,
     fit_in_rounds,
+    fit_windows,
     parallax_of,
 )
+from agalign.fit.windows import residual_under
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import BY_WINDOWS, JointResult
 from agalign.values.choices import Geometry, ReliefUse
@@ -111,8 +113,10 @@ def _parallax_groups(bands: Sequence[RefinedBand]) -> list[list[RefinedBand]]:
 def _common_parallax_px(group: Sequence[RefinedBand]) -> tuple[float, bool]:
     """Return the p95 of the parallax that is common to the bands, 0 if there is none, and if the baselines are on one
     line without tags that confirm them.
+
+    The distortion of the reference's lens is common to the bands too. What lens shapes explain is not parallax.
     """
-    residuals = _common_residuals(group)
+    residuals = [_beyond_lens_shapes(b, r) for b, r in zip(group, _common_residuals(group), strict=True)]
     # The p95 ignores single wrong peaks, which are not parallax.
     if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
         return 0.0, False
@@ -132,6 +136,18 @@ def _common_residuals(group: Sequence[RefinedBand]) -> list[Residual]:
     smallest = min((band.warped.windows for band in group), key=lambda windows: windows.side)
     common = group[0].pair.reference.large_windows if any(band.pair.is_blurred for band in group) else smallest
     return [b.warped.residual if b.warped.windows is common else common.residuals(b.warped.warped) for b in group]
+
+
+def _beyond_lens_shapes(band: RefinedBand, residual: Residual) -> Residual:
+    """Return the residual under the homography and the lens shapes that fit it, where no rig contains these."""
+    pair, mapping = band.pair, band.warped.mapping
+    if pair.unknown_lens_std_px is None:
+        return residual
+    fit = fit_windows(mapping, residual, pair.fixed.size_px, pair.unknown_lens_std_px)
+    assert fit is not None  # the prior of the shapes determines them
+    with suppress(GeometryError):
+        return residual_under(residual, mapping, fit.applied_to(mapping))
+    return residual
 
 
 def _layout_of(pairs: Sequence[BandPair]) -> NDArray[np.float64] | None:

@@ -55,6 +55,7 @@ from agalign.values.issues import (
     Issue,
     IssueKind,
 )
+from agalign.values.lens_shapes import lens_shapes
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
@@ -626,6 +627,27 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
         residual = residual_of(at, z[:, None] * np.array(band.baseline_m) / 0.0367)
         result.append(replace(candidate, warped=replace(candidate.warped, windows=windows, residual=residual)))
     assert shows_relief(result) == shown
+
+
+@pytest.mark.parametrize(
+    ("is_lens_known", "height_px", "shown"), [(False, 0, False), (True, 0, True), (False, 2, True)]
+)
+def test_unknown_distortion_of_lenses_is_not_relief(is_lens_known: bool, height_px: float, shown: bool) -> None:
+    """Bands have it in common, as it contains that of the reference; where a rig contains it, the rest is parallax."""
+    size_px = 1280, 960
+    image = whole(textured_image(*size_px))
+    reference = Reference(image)
+    at_px = reference.windows.centres_px
+    shapes_px = np.array([[0.2, -0.5, 2.2, 0.5], [0.1, -0.7, -1.8, -2.7], [-1.1, -0.2, -1.0, 2.1]])
+    baselines = np.array([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7]])
+    bands = []
+    for number, (of_band_px, baseline) in enumerate(zip(shapes_px, baselines, strict=True)):
+        pair = BandPair(str(number), reference, image, {"rig": np.eye(3)}, is_lens_known=is_lens_known)
+        z = np.where(np.arange(len(at_px)) % 3 == 0, height_px, 0.0)
+        residual = residual_of(at_px, lens_shapes(at_px, size_px) @ of_band_px + z[:, None] * baseline)
+        warped = WarpedPair(pair, pair.mapping(np.eye(3)), image, reference.windows, residual)
+        bands.append(RefinedBand(joint_result(np.eye(3)), warped))
+    assert shows_relief(bands) == shown
 
 
 @pytest.mark.parametrize(
