@@ -17,7 +17,6 @@ from agalign.fit.window_fit import cross_fitted, fit_in_rounds
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
-from agalign.verify.checks import MAX_ALIAS_PEAK
 
 _MAX_MOVED_PX = 16.0
 """Maximum distance of a corner from that of the seed, px of the reduced reference; larger ones contradict it."""
@@ -73,7 +72,7 @@ def in_windows_that_agree(band: BandCandidates) -> Candidate | None:
         return None
     mapping, held_out = fitted.mapping, fitted.held_out
     warped = WarpedPair.of(pair, mapping, windows)
-    if warped.alias_peak.ratio > MAX_ALIAS_PEAK:
+    if warped.alias_peaks:
         return None
     error = mapping_error(pair, mapping, fitted.fit.covariance_px2, held_out, mapping.field)
     return Candidate(pair, mapping, error, held_out, band.joint, warped, given_issues=band.rejected)

@@ -17,7 +17,7 @@ from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
-from agalign.verify.checks import AliasPeak, alias_peak, content_issues, repetition_issues
+from agalign.verify.checks import AliasPeak, alias_peaks, content_issues, repetition_issues
 from agalign.verify.coverage import points_in_frame, points_in_mask, unobserved_quarters
 
 
@@ -84,11 +84,11 @@ class WarpedPair:
         return replace(self, residual=held_out(self.residual, self.mapping, chessboard(self.residual), mappings))
 
     @cached_property
-    def alias_peak(self) -> AliasPeak:
-        """The highest correlation peak of the reduced images after that of the mapping."""
+    def alias_peaks(self) -> list[AliasPeak]:
+        """Correlation peaks of the reduced images that are nearly as high as that of the mapping."""
         reference = self.pair.reference
         moving = windowed_spectra(structure_field(shrink(self.warped, reference.seed_size_px)))
-        return alias_peak(reference.seed_spectrum, moving, reference.seed_scale)
+        return alias_peaks(reference.seed_spectrum, moving, reference.seed_scale)
 
     @cached_property
     def issues(self) -> tuple[Issue, ...]:
@@ -98,7 +98,7 @@ class WarpedPair:
         is_expected = partial(self.pair.is_expected, self.mapping.fixed_to_moving)
         return (
             *content_issues(residual, self.pair.file_pixel_size_px),
-            *repetition_issues(self.alias_peak, is_expected),
+            *repetition_issues(self.alias_peaks, is_expected),
         )
 
     @cached_property

@@ -93,7 +93,7 @@ class WindowFit:
 
     @property
     def scale_px(self) -> float:
-        """Robust standard deviation of the residuals."""
+        """Robust scale of the residuals, `shift_scale_px`."""
         return shift_scale_px(self.residuals_px[np.isfinite(self.residuals_px)])
 
     def applied_to(self, mapping: PixelMapping) -> PixelMapping:
@@ -144,7 +144,9 @@ def fit_windows(
         mean = np.r_[mean, baseline.mean]
     robust = Robust(_CAUCHY_SCALES, shift_scale_px, partial(shift_variance_px2, with_shapes=with_shapes))
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
-    covariance_px2 = estimate.covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
+    # The residuals have as many degrees of freedom fewer as parameters are fitted; priors determine the lens shapes.
+    fewer = 2 * len(raw.centres_px) / (2 * len(raw.centres_px) - count) if lens_std_px is None else 1.0
+    covariance_px2 = fewer * estimate.covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
 
 
@@ -333,7 +335,7 @@ class Adjustment:
 
     @property
     def scales_px(self) -> Array:
-        """(bands,) robust standard deviation of the residuals."""
+        """(bands,) robust scales of the residuals, `shift_scale_px`."""
         return np.array([fit.scale_px for fit in self.fits])
 
 

@@ -192,8 +192,8 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Pre
     """Predict a band from the estimate of the capture's factors with the smallest standard error, px.
 
     That is the leave-one-out error of the basis for learned captures with similar gaps, or the difference between
-    the captures used if that is larger. A gap that is larger than those of all learned captures is not validated: the
-    flight's mean remains.
+    the captures used if that is larger. A gap of more than _MAX_GAP_RATIO times those of all learned captures is not
+    validated: the flight's mean remains.
     """
     min_for_altitude = 6  # with fewer captures, the basis with the smallest error would be selected by chance
     design, results = rig.design(band), []

@@ -95,7 +95,7 @@ def step_from(net: Descriptor, band: LevelBand, patches: ReferencePatches, famil
 
 
 def converge(net: Descriptor, band: LevelBand, all_patches: ReferencePatches, family: ModelFamily | None) -> Step:
-    """Take steps on psi until no corner moves by more than `_FINAL_CONVERGED_PX`; return the last one.
+    """Take steps on psi, at most ten, until no corner moves by more than `_FINAL_CONVERGED_PX`; return the last one.
 
     Long steps use half of the patches, if these are enough. Steps with all patches shrink by a constant ratio, so every
     second one is extended by the sum of the geometric series (Aitken 1926). A step of infinite length is the last one

@@ -227,8 +227,8 @@ class Alignment:
     joint: JointResult | None = None
     """The band's own estimate with its expected error; None without one."""
     residual: Residual | None = None
-    """Shifts of windows, each under a mapping that was estimated without the window; of all windows under a seed or a
-    prediction of the rig."""
+    """Shifts of windows, each under a mapping that was estimated without the window (with a displacement field, under
+    the field without the window); of all windows under a seed or a prediction of the rig."""
     seconds: float = 0.0
     """Share of the capture's processing time, s, equal for all its bands."""
     before: Similarity = field(default_factory=Similarity)
@@ -427,7 +427,7 @@ class Alignment:
         -------
         array
             (...), float64: RMS distance of mapped from true positions, px of the reference; infinite where it is
-            unknown, as in bands that are `seed_only` or `failed`.
+            unknown, as in bands that are `seed_only` or `failed`, and for NaN, as `inverse` returns it.
 
         Raises
         ------
@@ -443,9 +443,11 @@ class Alignment:
         (True, True)
         """
         points_px = positions_of(reference_px, "reference_px")
-        if self.error is None:
-            return np.full(points_px.shape[:-1], np.inf)
-        return self.error.error_px(points_px.reshape(-1, 2)).reshape(points_px.shape[:-1])
+        errors_px = np.full(points_px.shape[:-1], np.inf)
+        if self.error is not None:
+            is_known = np.isfinite(points_px).all(axis=-1)
+            errors_px[is_known] = self.error.error_px(points_px[is_known])
+        return errors_px
 
     @property
     def error_map_px(self) -> FloatImage:

@@ -1,7 +1,7 @@
 """The expected error of a mapping: all that is known of it, in one record, and its value at any point.
 
 Standard error, error map, quality flags, report and `Alignment.error_px` are this one quantity; so is the status, which
-counts the error of a relief at the windows only.
+counts the error of a relief at the windows only, and does not count areas that moved, which are found after it.
 """
 
 import math

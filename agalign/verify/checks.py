@@ -5,7 +5,7 @@ pixels of the images. The worst error is a wrong alignment called `aligned`. Neg
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -163,20 +163,28 @@ def content_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
 
 
 def _solid_area(cells: NDArray[np.int64], is_lost: NDArray[np.bool_]) -> int:
-    """Return the number of lost windows in squares of only lost ones, of a side that scattered ones do not fill.
+    """Return the number of lost windows in rectangles of only lost ones that scattered ones do not fill.
 
-    `cells` are the columns and rows (n, 2) of the windows.
+    `cells` are the columns and rows (n, 2) of the windows. How many windows are scattered is their share outside of a
+    rectangle, as an area of another content may be a large part of the image, and a strip as well as a block.
     """
-    max_chance = 0.01  # that scattered windows fill a square somewhere
-    share = float(is_lost.mean()) if len(is_lost) else 0.0
-    sides = (3, 4, 5, 6)  # the last for two thirds of lost windows, above which the coverage is too small
-    side = next((k for k in sides if len(cells) * share ** (k * k) <= max_chance), None)
-    if share == 0 or side is None:
+    max_chance = 0.0025  # that scattered windows fill a rectangle of one shape somewhere
+    min_side, min_windows = 2, 8  # smaller areas without a peak are normal
+    count, lost = len(cells), int(is_lost.sum())
+    if lost < min_windows:
         return 0
     occupied = np.zeros(cells.max(axis=0) + 1, np.uint8)
     occupied[tuple(cells[is_lost].T)] = 1
-    squares = cv2.morphologyEx(occupied, cv2.MORPH_OPEN, np.ones((side, side), np.uint8), borderValue=0)
-    return int(squares.sum())
+    sizes = np.arange(min_windows, lost + 1)
+    shares = (lost - sizes) / np.maximum(count - sizes, 1)
+    enough = sizes[count * shares**sizes <= max_chance]  # larger rectangles are less likely
+    solid = np.zeros_like(occupied)
+    for across in range(min_side, len(occupied) + 1 if len(enough) else 0):
+        along = max(min_side, -(-int(enough[0]) // across))
+        rectangle, last = np.ones((across, along), np.uint8), (along - 1, across - 1)
+        origins = cv2.erode(occupied, rectangle, anchor=(0, 0), borderValue=0)
+        solid |= cv2.dilate(origins, rectangle, anchor=last)
+    return int(solid.sum())
 
 
 def _largest_cluster(cells: NDArray[np.int64]) -> int:
@@ -201,16 +209,17 @@ def max_expected_px(std_px: float) -> float:
 
 
 class AliasPeak(NamedTuple):
-    """The highest correlation peak after that of the result: (x, y), px of the fixed image, and relative height."""
+    """Another correlation peak than that of the result: (x, y), px of the fixed image, and relative height."""
 
     shift_px: tuple[float, float]
     ratio: float
 
 
-def alias_peak(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> AliasPeak:
-    """Return the highest peak except that at zero shift; `fixed` and `moving` are windowed spectra (height, width).
+def alias_peaks(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> list[AliasPeak]:
+    """Return the peaks above MAX_ALIAS_PEAK except that at zero shift, the highest first; `fixed` and `moving` are
+    windowed spectra (height, width).
 
-    They are of images that are reduced by `scale`.
+    They are of images that are reduced by `scale`. Without a peak at zero shift, the highest one is returned.
     """
     surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
     height, width = surface.shape
@@ -219,24 +228,33 @@ def alias_peak(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> 
     centre = np.s_[row - radius_px : row + radius_px + 1, column - radius_px : column + radius_px + 1]
     centre_peak = float(surface[centre].max())
     surface[centre] = -np.inf
-    index = int(surface.argmax())
-    ratio = float(surface.flat[index]) / centre_peak if centre_peak > 0 else math.inf
-    return AliasPeak(((index % width - column) / scale.x, (index // width - row) / scale.y), ratio)
+    ratios = surface / centre_peak if centre_peak > 0 else np.where(surface == surface.max(), np.inf, 0.0)
+    is_highest = surface == cv2.dilate(surface, np.ones((2 * radius_px + 1,) * 2, np.uint8))
+    rows, columns = np.nonzero(is_highest & (ratios > MAX_ALIAS_PEAK))
+    found = zip((columns - column) / scale.x, (rows - row) / scale.y, ratios[rows, columns], strict=True)
+    return sorted((AliasPeak((float(x), float(y)), float(ratio)) for x, y, ratio in found), key=lambda a: -a.ratio)
 
 
-def repetition_issues(alias: AliasPeak, is_expected: Callable[[tuple[float, float]], bool]) -> Iterator[Issue]:
+def repetition_issues(
+    aliases: Sequence[AliasPeak], is_expected: Callable[[tuple[float, float]], bool]
+) -> Iterator[Issue]:
     """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it.
 
     `is_expected` returns True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or
     user.
     """
-    if alias.ratio > MAX_ALIAS_PEAK and (not is_expected((0.0, 0.0)) or is_expected(alias.shift_px)):
-        yield Issue(REPEATS, math.hypot(*alias.shift_px))
+    is_known = is_expected((0.0, 0.0))
+    for alias in aliases:
+        if not is_known or is_expected(alias.shift_px):
+            yield Issue(REPEATS, math.hypot(*alias.shift_px))
+            return
 
 
 def seed_fits(residual: Residual) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
     max_median_px = 8.0  # rig tags of flights have median errors of 2 to 9 px (benchmarks/seeds.py)
+    if len(residual.measured_px) < min(_MIN_WINDOWS, len(residual.centres_px)):
+        return False
     return residual.coverage >= _MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
 
 

@@ -166,6 +166,14 @@ def test_the_covariance_equals_the_scatter_of_repeated_fits() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(expected)), rtol=0.25)
 
 
+def test_the_covariance_of_few_windows_is_not_that_of_their_small_residuals() -> None:
+    """Twelve windows have 24 components, of which the eight parameters explain a third."""
+    centres_px = geometry.lattice(*SIZE, 4, 3)
+    fits = [fitted(windows(np.zeros(8), centres_px, noise_px=0.3, seed=seed)) for seed in range(300)]
+    errors, covariances = np.stack([f.corners_px for f in fits]), np.mean([f.covariance_px2 for f in fits], axis=0)
+    assert np.sqrt((errors**2).sum(axis=1).mean() / np.trace(covariances)) == pytest.approx(1.0, abs=0.08)
+
+
 # ---- lens shapes
 
 

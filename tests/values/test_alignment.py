@@ -10,6 +10,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.geometry import PairScales
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.pixel_units import PixelScale
 
 from ..builders import joint_result, residual_of
@@ -57,6 +58,14 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
     kept = ("space", "geometry", "status", "issues", "seconds", "before", "after", "prediction")
     assert [getattr(between_files, k) for k in kept] == [getattr(between_images, k) for k in kept]
     assert PairScales() == PairScales(PixelScale(1.0, 1.0), PixelScale(1.0, 1.0))
+
+
+def test_the_error_is_infinite_where_no_position_is_known() -> None:
+    known = MappingError((150, 100), covariance_px2=0.01 * np.eye(8), residual=residual_of(POINTS, (0.1, 0.1)))
+    seed = Seed("rig", geometry.translation(5, -3), 30.0)
+    alignment = Alignment(PixelMapping(H), (150, 100), (), seed, error=known)
+    errors_px = alignment.error_px([[[np.nan, np.nan], [np.inf, 3.0]], [[3.0, 4.0], [100.0, 7.0]]])
+    assert np.isfinite(errors_px).tolist() == [[False, False], [True, True]]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,8 @@ from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 from agalign.values.residual import Residual
 from agalign.verify.checks import (
-    alias_peak,
+    AliasPeak,
+    alias_peaks,
     content_issues,
     is_unchanged,
     issues_of,
@@ -218,12 +219,14 @@ def test_aligned_means_an_error_of_half_a_pixel_in_nine_tenths_of_the_image() ->
 
 
 def test_an_area_without_common_peaks_shows_something_else_but_scattered_windows_do_not() -> None:
-    torn, scattered, noisy, corner = (np.zeros((9, 12), bool) for _ in range(4))
+    torn, scattered, noisy, corner, strips = (np.zeros((9, 12), bool) for _ in range(5))
     torn[5:] = True
     scattered[::2, ::2] = True
     noisy[:] = np.random.default_rng(0).random((9, 12)) < 0.4
     corner[:3, :3] = True
-    for lost, expected in ((torn, ["other_content"]), (scattered, []), (noisy, []), (corner, ["other_content"])):
+    strips[:, :2] = strips[:, -2:] = True
+    area = ["other_content"]
+    for lost, expected in ((torn, area), (scattered, []), (noisy, []), (corner, area), (strips, area)):
         shifts = np.where(lost.reshape(-1, 1), np.nan, 0.0) * np.ones((1, 2))
         residual = residual_of(112 * grid_px(np.arange(12), np.arange(9)) + 56, shifts)
         assert [issue.code for issue in content_issues(residual, 1.0)] == expected
@@ -239,6 +242,16 @@ def test_an_area_of_another_place_is_found_in_many_windows(share: float) -> None
         shifts = np.where(is_lost.reshape(-1, 1), np.nan, 0.0) * np.ones((1, 2))
         residual = residual_of(112 * grid_px(np.arange(24), np.arange(16)) + 56, shifts)
         assert [issue.code for issue in content_issues(residual, 1.0)] == codes
+
+
+@pytest.mark.parametrize(("columns", "rows", "lost"), [(11, 8, 2), (6, 5, 3), (6, 4, 3), (7, 5, 3), (5, 4, 2)])
+def test_an_area_of_another_place_is_found_in_few_windows(columns: int, rows: int, lost: int) -> None:
+    is_lost = np.zeros((rows, columns), bool)
+    is_lost[:, -lost:] = True
+    shifts = np.where(is_lost.reshape(-1, 1), np.nan, 0.0) * np.ones((1, 2))
+    residual = residual_of(112 * grid_px(np.arange(columns), np.arange(rows)) + 56, shifts)
+    (issue,) = content_issues(residual, 1.0)
+    assert issue.value == pytest.approx(lost / columns)
 
 
 def test_misaligned_clusters_are_an_issue_but_scattered_and_unmeasured_windows_are_not() -> None:
@@ -276,12 +289,26 @@ def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded(
     """The images also match with a shift of 16 px along x: every 8 px of images with half the width."""
     rng = np.random.default_rng(0)
     spectrum = np.fft.fft2(np.tile(rng.normal(size=(64, 8)), (1, 8))).astype(np.complex64)
-    alias = alias_peak(spectrum, spectrum, PixelScale(0.5, 0.25))
-    x_px, y_px = alias.shift_px
+    aliases = alias_peaks(spectrum, spectrum, PixelScale(0.5, 0.25))
+    x_px, y_px = aliases[0].shift_px
     assert (abs(x_px) % 16, y_px, x_px == 0) == (0, 0, False)
-    issues = list(repetition_issues(alias, lambda shift_px: float(np.hypot(*shift_px)) <= expected_within_px))
+    issues = list(repetition_issues(aliases, lambda shift_px: float(np.hypot(*shift_px)) <= expected_within_px))
     assert [issue.code for issue in issues] == codes
     assert all(issue.value == pytest.approx(abs(x_px)) for issue in issues)
+
+
+def test_an_expected_alias_is_an_issue_also_if_a_higher_one_is_not_expected() -> None:
+    """As in rows with a lattice of plants: the next plant is far from the seed, the next row is not."""
+    aliases = [AliasPeak((-32.0, 0.0), 0.93), AliasPeak((0.0, 14.0), 0.82)]
+    (issue,) = repetition_issues(aliases, lambda shift_px: np.hypot(*shift_px) <= 15)
+    assert (issue.code, issue.value) == ("repeats", 14.0)
+    assert list(repetition_issues(aliases[:1], lambda shift_px: np.hypot(*shift_px) <= 15)) == []
+    rng = np.random.default_rng(0)
+    lattice = np.tile(rng.normal(size=(16, 16)), (4, 4)) + 0.1 * np.tile(rng.normal(size=(64, 16)), (1, 4))
+    spectrum = np.fft.fft2(lattice).astype(np.complex64)
+    found = alias_peaks(spectrum, spectrum)
+    assert found[0].shift_px == (-32.0, 0.0)
+    assert {(16.0, 0.0), (0.0, -16.0)} <= {peak.shift_px for peak in found}
 
 
 PERIOD = 26.0
@@ -300,7 +327,7 @@ def planted(shift: tuple[float, float], seed: int, sign: float = 1.0) -> np.ndar
 def test_a_unique_scene_has_no_alias_peak() -> None:
     image = texture(400, 300)
     views = image, whole(cv2.GaussianBlur(-image.pixels, (0, 0), 0.7))
-    assert alias_peak(*(windowed_spectra(structure_field(view)) for view in views)).ratio < 0.4
+    assert alias_peaks(*(windowed_spectra(structure_field(view)) for view in views)) == []
 
 
 IMAGES = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
@@ -326,6 +353,13 @@ def test_a_seed_with_an_error_below_half_a_period_resolves_aliases() -> None:
 @pytest.mark.parametrize(("coverage", "median_px", "fits"), [(0.3, 8.0, True), (0.29, 8.0, False), (0.3, 8.1, False)])
 def test_a_seed_fits_up_to_its_limits(coverage: float, median_px: float, fits: bool) -> None:
     assert seed_fits(measured_in(coverage, median_px)) == fits
+
+
+def test_one_window_of_many_does_not_confirm_a_seed() -> None:
+    """A small image has no more than four."""
+    for count, total, fits in ((1, 3, False), (3, 3, True), (4, 12, False), (5, 12, True)):
+        shifts_px = np.where(np.arange(total)[:, None] < count, (3.0, 0.0), np.nan)
+        assert seed_fits(residual_of(np.zeros((total, 2)), shifts_px)) == fits, (count, total)
 
 
 @pytest.mark.parametrize("magnification", [0.5, 1.0, 3.0])
