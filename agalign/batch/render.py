@@ -223,7 +223,9 @@ def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPa
 
 
 def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> str | None:
-    """Return the implausible tag that makes `auto` write radiance instead of reflectance; None if there is none."""
+    """Return the implausible or lacking tag by which `auto` writes radiance instead of reflectance; None if there is
+    none.
+    """
     lost = (b for b in capture.bands if b.implausible and b.radiometry is not None and b.radiometry.is_of_light)
     return next((f"{b.name}: {b.implausible}" for b in lost), None) if choice == "auto" else None
 

@@ -26,8 +26,8 @@ def with_complete_calibrations(files: Sequence[ImageFile]) -> list[ImageFile]:
     has_all = {}
     for key, of_camera in by_camera.items():
         known = [b.radiometry for file in of_camera for b in file.bands if b.radiometry]
-        of_sun = (radiometry.by_sun.errors for radiometry in known if radiometry.by_sun)
-        has_all[key] = _known(radiometry.errors for radiometry in known), _known(of_sun)
+        of_sun = [radiometry.by_sun.errors for radiometry in known if radiometry.by_sun]
+        has_all[key] = _known(radiometry.errors for radiometry in known), _known(of_sun), bool(of_sun)
     return [
         replace(file, bands=tuple(_without_incomplete(b, *has_all[_camera(file)]) for b in file.bands))
         for file in files
@@ -44,11 +44,15 @@ def _known(of_files: Iterable[Sequence[RadiometricError]]) -> frozenset[str]:
     return frozenset[str]().union(*lacking) - frozenset.intersection(*lacking) if lacking else frozenset()
 
 
-def _without_incomplete(band: Band, of_radiance: frozenset[str], of_sun: frozenset[str]) -> Band:
-    """A band without a calibration, or its factor to reflectance, that lacks one of these factors."""
+def _without_incomplete(band: Band, of_radiance: frozenset[str], of_sun: frozenset[str], has_sensor: bool) -> Band:
+    """A band without a calibration, or its factor to reflectance, that lacks one of these factors, or with the reason
+    why it has no factor if the camera `has_sensor` for the light.
+    """
     radiometry = band.radiometry
     if radiometry is None:
         return band
+    if has_sensor and radiometry.is_of_light and radiometry.by_sun is None and not band.implausible:
+        return replace(band, implausible="its tags lack the irradiance, which other files of the camera have")
     if lacking := _missing(radiometry.errors) & of_radiance:
         why = f"its tags lack the {' and '.join(sorted(lacking))}, which other files of the camera have"
         return replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({why})")

@@ -17,7 +17,7 @@ from agalign.pixels.gdal import without_warnings
 from agalign.pixels.panel_detection import DetectedPanel, albedo_of, evenly_lit, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile
-from agalign.values.capture import Band, Capture, Panel, PanelSource, known_time_s
+from agalign.values.capture import Band, Capture, Panel, PanelSource, distance_km, known_time_s
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
 from agalign.values.radiometric_errors import LIGHT_SENSOR, PANEL_AND_SENSOR, contradiction, panel_errors
@@ -39,6 +39,8 @@ MIN_LIGHT_RATIO = 0.5
 """Of the light on a panel relative to that on another one of the hour: in the shade it is 0.1 to 0.4."""
 _SAME_ALBEDO = 0.01
 """Relative difference of the reflectance of one panel by two captures: files round it to 0.1 %."""
+_MAX_DISTANCE_KM = 1.0
+"""From a panel whose altitude is that of the ground: farther away, it may be of another field."""
 _MIN_HEIGHT_M = 3.0
 """Lower heights are within the error of the altitudes."""
 
@@ -246,36 +248,56 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
 
         factor = albedo / (radiance of the panel) * E_p / E
 
-    E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the
-    panels of the camera, the reciprocals are interpolated linearly in time; before the first and after the last, they
-    are constant. If the time of the capture or of the panels is unknown, `_without_clock` chooses the panel; without
-    one the result is empty. A panel with less than half of the light on another one of the hour is not used.
+    E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels: for all bands of
+    the capture alike, as the change of the light would not cancel in an index of bands under different light. Between
+    the panels of the camera, the reciprocals are interpolated linearly in time; before the first and after the last,
+    they are constant. If the time of the capture or of the panels is unknown, `_without_clock` chooses the panel;
+    without one the result is empty. A panel with less than half of the light on another one of the hour is not used.
     """
     of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
     timed = _within_hours(of_camera, capture)
     near = timed or _without_clock(of_camera, capture)
     used = [(s, r) for s, r in near if r.is_used]
-    fits_sensor, result = all(r.fits_sensor for _, r in used), {}
-    for band in capture.bands:
-        samples = [(s, b) for s, r in used for b in r.bands if b.band.name == band.name]
-        scales = [(s, b.sensor_scale) for s, b in samples if b.sensor_scale]
-        light = [(s, 1 / b.factor) for s, b in samples if b.factor]
-        sun = None if band.radiometry is None else band.radiometry.by_sun
-        contradictions = _contradictions([r for _, r in near], band.name)
-        measured = sorted((abs(s), b.spread) for s, b in samples if b.factor)
-        nearest_s, spread = measured[0] if measured else (0.0, 0.0)
-        age_s = nearest_s if timed and measured else None
-        if sun and scales and fits_sensor:
+    light = _of_panels(used, lambda b: None if b.factor is None else 1 / b.factor)
+    scales = _of_panels(used, lambda b: b.sensor_scale)
+    suns = {b.name: b.radiometry.by_sun for b in capture.bands if b.radiometry is not None and b.name in light}
+    is_by_sensor = all(r.fits_sensor for _, r in used) and all(suns.values()) and suns.keys() <= scales.keys()
+    result = {}
+    for band in (b for b in capture.bands if b.name in light):
+        measured = [(abs(s), b.spread) for s, r in used for b in r.bands if b.band.name == band.name and b.factor]
+        nearest_s, spread = min(measured)
+        age_s = nearest_s if timed else None
+        sun = suns.get(band.name)
+        if sun is not None and is_by_sensor:
             source: RadiometrySource = "panel and light sensor"
-            value = sun.value / _interpolated(scales)
+            value = sun.value / _interpolated(scales[band.name])
             tilt = [e for e in sun.errors if e not in LIGHT_SENSOR.values()]  # its scale is that of the panel
-            errors = (*panel_errors(spread, None), *_difference(scales), *tilt)
-        elif light:
-            value, source = 1 / _interpolated(light), "panel"
-            errors = (*panel_errors(spread, age_s), *_difference(light))
+            errors = (*panel_errors(spread, None), *_difference(scales[band.name]), *tilt)
         else:
-            continue
+            value, source = 1 / _interpolated(light[band.name]), "panel"
+            errors = (*panel_errors(spread, age_s), *_difference(light[band.name]))
+        contradictions = _contradictions([r for _, r in near], band.name)
         result[band.name] = ReflectanceFactor(value, "reflectance", source, age_s, (*errors, *contradictions))
+    return result
+
+
+def _of_panels(
+    used: Sequence[tuple[float, PanelReading]], value: Callable[[BandReading], float | None]
+) -> dict[str, list[tuple[float, float]]]:
+    """Return (seconds after the capture, value) of the panels by band, for each band that any of them has.
+
+    What a panel lacks in a band, as it is saturated there, is that of the panel nearest in time which has it, times the
+    median ratio of the two in the other bands: the light changes alike in all.
+    """
+    known = [(s, {b.band.name: v for b in reading.bands if (v := value(b))}) for s, reading in used]
+    result = dict[str, list[tuple[float, float]]]()
+    for name in dict.fromkeys(name for _, values in known for name in values):
+        having = [(s, values) for s, values in known if name in values]
+        result[name] = [(s, values[name]) for s, values in having]
+        for s, values in (one for one in known if name not in one[1]):
+            _, other = min(having, key=lambda one: abs(one[0] - s))
+            if ratios := [values[n] / other[n] for n in values.keys() & other.keys()]:
+                result[name].append((s, other[name] * float(np.median(ratios))))
     return result
 
 
@@ -344,13 +366,15 @@ def _far_in_time(capture: Capture, readings: Sequence[PanelReading]) -> str:
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
     """Return the capture with its height above the ground from the altitude of a panel.
 
-    Captures with a height in the tags, without an altitude or without a panel within hours are not changed.
+    Captures with a height in the tags, without an altitude or without a panel within hours and a kilometre are not
+    changed.
     """
-    pose = capture.pose
-    if pose is None or pose.height_m is not None or capture.altitude_m is None:
+    pose, here = capture.pose, capture.position
+    if pose is None or pose.height_m is not None or capture.altitude_m is None or here is None:
         return capture
     on_ground = [r.capture for _, r in _within_hours(readings, capture) if r.capture.is_of_a_panel]
-    altitudes_m = [c.altitude_m for c in on_ground if c.altitude_m is not None]
+    near = [c for c in on_ground if c.position is not None and distance_km(c.position, here) <= _MAX_DISTANCE_KM]
+    altitudes_m = [c.altitude_m for c in near if c.altitude_m is not None]
     above_panel_m = 1.0  # of the camera when a panel is recorded
     height_m = capture.altitude_m - min(altitudes_m) + above_panel_m if altitudes_m else 0.0
     if height_m <= _MIN_HEIGHT_M:

@@ -34,6 +34,8 @@ def to_check(index: Index | None, unit: str, sidecar: Sidecar, run: RunFacts, la
     if not index.any_unit and unit != "reflectance":
         what = "which no tag states" if unit == UNSTATED else f"which are {unit}, not reflectance"
         result.append(f"its value depends on the unit of the bands, {what}")
+    elif unit.endswith("radiance"):
+        result.append(f"the light in each band is a part of its value, as the bands are {unit}, not reflectance")
     with suppress(InputError):  # other bands than those of the sidecar
         names = [b.band for b in sidecar.bands]
         used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}

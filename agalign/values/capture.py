@@ -161,7 +161,7 @@ class Band:
     missing_calibration: str = ""
     """Why it has no radiometric calibration, with the missing tags; empty if it has one or the camera has none."""
     implausible: str = ""
-    """Tag with an implausible value that leaves out `radiometry`, or its factor to reflectance, in words."""
+    """Tag that is implausible or lacking, which leaves out `radiometry` or its factor to reflectance, in words."""
     panel: Panel | None = None
     """Calibration panel in the image."""
 

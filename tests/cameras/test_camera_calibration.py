@@ -12,11 +12,13 @@ import pytest
 import tifffile
 from PIL.ExifTags import GPS as GPS_TAG
 
+from agalign.batch.render import lost_reflectance
 from agalign.cameras.consistency import far_from_flight
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.sun import sun_position
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Entry, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import camera_overviews, flights_of
+from agalign.pixels.radiometry import with_radiometry
 from agalign.values.capture import Band, Capture, CaptureTime
 
 from ..conftest import write_band
@@ -77,6 +79,18 @@ def test_a_band_without_a_factor_that_the_others_have_has_no_reflectance(
     capture = only(discover(images))
     assert [b.name for b in capture.bands if b.radiometry is None] == ["NIR"]
     assert "its tags lack the vignetting, which other files of the camera have" in nir(images).missing_calibration
+
+
+def test_a_band_without_the_irradiance_that_other_files_have_says_so(images: Path) -> None:
+    """Otherwise, its capture would be radiance between others of reflectance, without a word."""
+    changed(images / "IMG_0001_4.tif", "DLS:HorizontalIrradiance", "DLS:SpectralIrradiance", "Camera:Irradiance")
+    assert nir(images).radiometry.by_sun is None
+    assert nir(images).implausible == "its tags lack the irradiance, which other files of the camera have"
+    capture = with_radiometry(only(discover(images)), "auto", {})
+    assert (lost_reflectance(capture, "auto") or "").startswith("NIR: its tags lack")
+    for path in images.iterdir():
+        changed(path, "DLS:HorizontalIrradiance", "DLS:SpectralIrradiance", "Camera:Irradiance")
+    assert not any(band.implausible for band in only(discover(images)).bands)
 
 
 def test_a_factor_that_all_files_lack_is_named_with_its_size(images: Path) -> None:

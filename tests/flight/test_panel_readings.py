@@ -163,6 +163,40 @@ def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -
     assert reflectance_factors(in_same_unit, [relative])["Green"].value == pytest.approx(np.pi / 1.1)
 
 
+@pytest.mark.parametrize("lacking", ["capture", "panel"])
+def test_the_bands_of_a_capture_are_under_one_light(lacking: str) -> None:
+    """The light has halved since the panel. Red lacks the irradiance, so no band follows the sensor: the ratio of two
+    bands is that of their radiances then.
+    """
+    panel = lit_panel("2026-06-21T10:00:00", 1.0, 1.0)
+    bands = lit(0.5), lit(0.5, name="Red")
+    without = replace(bands[1], radiometry=PLAIN)
+    if lacking == "panel":
+        panel = replace(panel, bands=(panel.bands[0], replace(panel.bands[1], band=without)))
+    later = replace(
+        capture(GREEN, "2026-06-21T10:30:00"), bands=(bands[0], without if lacking == "capture" else bands[1])
+    )
+    factors = reflectance_factors(later, [panel])
+    assert facts(factors) == dict.fromkeys(("Green", "Red"), (pytest.approx(np.pi), "panel", 1800))
+    whole = reflectance_factors(replace(later, bands=bands), [lit_panel("2026-06-21T10:00:00", 1.0, 1.0)])
+    assert facts(whole) == dict.fromkeys(("Green", "Red"), (pytest.approx(2 * np.pi), "panel and light sensor", 1800))
+
+
+def test_a_panel_that_is_saturated_in_a_band_has_there_the_change_of_the_light_in_the_others() -> None:
+    """The second panel has 1.25 times the light of the first one; only the first shows NIR."""
+    moments = "2026-06-21T10:00:00", "2026-06-21T11:00:00"
+    first, second = (lit_panel(moment, 1.0, 1.0, 1.0) for moment in moments)
+    brighter = [replace(b, radiance=1.25 * (b.radiance or 0)) for b in second.bands]
+    saturated = replace(brighter[2], radiance=None, problem="5% of it is saturated")
+    plain = tuple(replace(b.band, radiometry=PLAIN) for b in first.bands)
+    flown = replace(first.capture, captured_at="2026-06-21T10:45:00", bands=plain)
+    panels = [first, replace(second, bands=(*brighter[:2], saturated))]
+    factors = reflectance_factors(flown, panels)
+    assert [f.value for f in factors.values()] == [pytest.approx(np.pi / 1.1875)] * 3
+    differences = [e.std_percent for f in factors.values() for e in f.errors if e.name == "difference of the panels"]
+    assert differences == [pytest.approx(100 * (1.25**0.5 - 1))] * 3
+
+
 @pytest.mark.parametrize(("scale", "source"), [(1.18, "panel and light sensor"), (1.4, "panel")])
 def test_a_panel_that_differs_from_the_light_sensor_in_one_band_is_not_combined_with_it(
     scale: float, source: str
@@ -182,6 +216,8 @@ def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
     with_tags = replace(high, pose=Pose(30.0, height_m=25.0))
     assert with_height(with_tags, [ground]) == with_tags
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
+    on_another_field = replace(ground, capture=replace(ground.capture, position=Position(52.1, 5.0, 93.0)))
+    assert with_height(high, [on_another_field]) == high
 
 
 def found(folder: Path, seconds: Iterable[int], shown: Sequence[int], undated: int | None = None) -> list[int]:

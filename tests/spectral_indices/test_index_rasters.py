@@ -234,7 +234,8 @@ def test_a_formula_of_the_user_that_depends_on_the_unit_is_told(tmp_path: Path) 
     problem = "its value depends on the unit of the bands, which are radiance, not reflectance"
     assert done.stderr.endswith(f"(column problem of indices.csv), such as 0000SET/IMG_0001 mine: {problem}\n")
     write_pages(tmp_path, pytest.fail)
-    assert [row["problem"] for row in table_in(tmp_path / "indices.csv")] == [problem, ""]
+    of_ratio = "the light in each band is a part of its value, as the bands are radiance, not reflectance"
+    assert [row["problem"] for row in table_in(tmp_path / "indices.csv")] == [problem, of_ratio]
 
 
 def test_only_new_indices_are_calculated(tmp_path: Path) -> None:
