@@ -3,13 +3,14 @@
 The unknowns are delta_b (8,), the displacements of the corners of band b relative to the mapping by the descriptors.
 Three sources are combined:
 
-    descriptors   0 = delta_b + N(0, C_b)                 the last step of the method, with its covariance
+    descriptors   0 = delta_b + N(0, k_b C_b)             the last step of the method, with its covariance
     windows       s_i = D(x_i) delta_b + noise            residual shifts of the structure
     rig           delta_b = r_b + t(0, S_b)               its prediction from the capture's other bands
 
-Bands whose descriptors fail are estimated from the other two. Bands with little texture depend on the other bands and
-the rig. The residuals of the rig have a Student's t distribution, so a band that contradicts it by many standard
-deviations is not biased by it.
+k_b >= 1 is chi^2 / 8 of the difference between descriptors and windows. Where these contradict each other, the windows
+are right: patches of water or noise hold the descriptors near their seed. Bands whose descriptors fail are estimated
+from the other two. Bands with little texture depend on the other bands and the rig. The residuals of the rig have a
+Student's t distribution, so a band that contradicts it by many standard deviations is not biased by it.
 """
 
 from collections.abc import Sequence
@@ -31,8 +32,8 @@ from agalign.values.geometry import Matrix
 from agalign.values.least_squares import Robust, least_squares
 from agalign.values.residual import Residual
 
-_MAX_CORRECTION_PX = 1.0
-"""Of a corner, by windows; larger ones contradict the mapping."""
+_MAX_CORRECTION_PX = 4.0
+"""Of a corner, by windows; larger ones contradict the mapping, or are of the next crop row."""
 
 
 def with_map_estimates(
@@ -90,9 +91,10 @@ def _estimates(
 
 def _with_windows(pair: BandPair, result: JointResult, fit: WindowFit) -> JointResult:
     """Combine the result of the descriptors, if they have one, with a fit to windows under it."""
-    of_windows = np.linalg.inv(fit.covariance_px2)
-    known = result.corner_covariance_px2
-    covariance = fit.covariance_px2 if known is None else np.linalg.inv(np.linalg.inv(known) + of_windows)
+    of_windows, covariance = np.linalg.inv(fit.covariance_px2), fit.covariance_px2
+    if (known := result.corner_covariance_px2) is not None:
+        chi2 = float(fit.corners_px @ np.linalg.solve(known + fit.covariance_px2, fit.corners_px))
+        covariance = np.linalg.inv(np.linalg.inv(known * max(1.0, chi2 / 8)) + of_windows)
     return _displaced(pair, result, covariance @ of_windows @ fit.corners_px, covariance)
 
 
