@@ -98,7 +98,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
-    began_s, settings, out = time.perf_counter(), task.settings, task.out
+    began_s, settings, out, states = time.perf_counter(), task.settings, task.out, input_states(task.capture)
     read, path, once = CapturePixels().read, CapturePaths.of(task.capture, out).sidecar, cache(read_with_change)
     refuse_to_overwrite([task.capture], out, settings.write, once)
     earlier, is_intact = earlier_result(path, once)
@@ -114,7 +114,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         sidecar, alignments = earlier, alignments_of(earlier, path.parent)
     else:
         model = None if task.model is None else loaded_model(task.model, settings.joint.device)
-        sidecar, alignments = estimate(capture, out, settings, model, progress, earlier, read)
+        sidecar, alignments = estimate(capture, out, settings, model, progress, earlier, read, states)
     progress(capture.reference.name, "writing", 0.0)
     report = render(capture, out, settings, sidecar, alignments, task.rendering, read)
     return replace(report, seconds=time.perf_counter() - began_s)
@@ -128,6 +128,7 @@ def estimate(
     progress: PairProgress,
     earlier: Sidecar | None,
     read: ReadTile,
+    states: Mapping[str, str],
 ) -> tuple[Sidecar, dict[str, Alignment]]:
     """Align the bands of a capture; write its sidecar, and its parallax if it has a relief.
 
@@ -135,10 +136,14 @@ def estimate(
 
     The sidecar lists the products of the `earlier` one, which describe another estimate, until they are rendered again.
     A parallax file without the mark of the program is kept.
-    `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.
+    `read` reads the pixels of the files, whose `states` were taken before. Raises UnreadableFileError if the reference
+    cannot be read, or if a file was changed meanwhile, and OutputError.
     """
     began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
     alignments = align_capture_bands(capture, settings, model, progress, read)
+    facts_of_input = {"input_samples": input_samples(capture), "input_digests": input_digests(capture)}
+    if changed := [b for b in capture.bands if states.get(b.name) != input_states(capture).get(b.name)]:
+        raise UnreadableFileError(f"{changed[0].path}: was changed while it was read", "run again")
     progress(capture.reference.name, "writing", 0.0)
     relief, path, parallax = relief_of(alignments), paths.file(PARALLAX_SUFFIX), None
     if relief is not None:
@@ -150,9 +155,8 @@ def estimate(
     facts: dict[str, Any] = {
         "parallax": parallax,
         "model": "" if model is None else model.fingerprint,
-        "input_samples": input_samples(capture),
-        "input_digests": input_digests(capture),
-        "input_states": input_states(capture),
+        **facts_of_input,
+        "input_states": dict(states),
         "seconds": time.perf_counter() - began_s,
     }
     if earlier is not None:

@@ -316,7 +316,7 @@ def _same_exposure(result: Sidecar, captures: Sequence[Capture], by_sample: Call
     if result.capture_id:
         of_id = (c for c in captures if c.capture_id == result.capture_id and is_same(result, c))
         return next((c.label for c in of_id), "")
-    return next((by_sample()[sample] for sample in result.input_samples.values() if sample in by_sample()), "")
+    return next((by_sample()[sample] for sample in sorted(result.own_samples) if sample in by_sample()), "")
 
 
 def _labels_by_sample(captures: Iterable[Capture]) -> dict[str, str]:

@@ -85,7 +85,7 @@ def _refuse_indices_of_others(tasks: Sequence[IndexTask]) -> None:
             with suppress(SidecarError):  # reported when its task is done
                 sidecar = read_sidecar(task.sidecar)
                 files = {task.sidecar.parent / band.place.file for band in sidecar.bands if band.place is not None}
-                if any(raster.is_of_other(file, sidecar.input_samples.values()) for file in files):
+                if any(raster.is_of_other(file, sidecar.own_samples) for file in files):
                     raise ConfigurationError(f"{raster.path}: is of another flight; choose another folder with -o")
 
 
@@ -132,7 +132,7 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
             files = ListedFiles.of(sidecar, task.sidecar.parent, task.file_states)
-            samples = sidecar.input_samples.values()
+            samples = sidecar.own_samples
             written = write_rasters(
                 bands, task.indices, base, task.label, overwrite=task.overwrite, listed=files, samples=samples
             )

@@ -30,7 +30,7 @@ from agalign.records.run_record import file_states
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import OtherSchemaError, is_sidecar, read_with_change
 from agalign.spectral_indices.rasters import index_rasters
-from agalign.values.capture import Capture, CaptureTime
+from agalign.values.capture import Capture, CaptureTime, source_file
 
 _Action = Literal["write", "remove", "keep", "refuse"]
 
@@ -212,7 +212,8 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     """Return whether a result is of this capture; None if neither tags nor contents decide.
 
     The comparison uses the tags that both have: make, model, serial numbers, capture id and time. Without id and time,
-    the contents of one file must be equal; the other files may have been repaired.
+    the contents of one file must be equal; the other files may have been repaired. Of mosaics, that is not the
+    reference, and a file at the same place suffices.
     """
     one, other = earlier.camera, capture.camera
     pairs = (one.make, other.make), (one.model, other.model), (earlier.capture_id, capture.capture_id)
@@ -223,9 +224,13 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
         return before is not None and now is not None and abs(before.utc - now.utc) <= _MAX_APART
     if (earlier.capture_id and capture.capture_id) or (earlier.captured_at and capture.captured_at):
         return True
-    if not earlier.input_samples:
+    if not earlier.own_samples:
         return None
-    return not {*earlier.input_samples.values()}.isdisjoint(input_samples(capture).values())
+    if not earlier.own_samples.isdisjoint(input_samples(capture).values()):
+        return True
+    # A mosaic that was made again has other contents.
+    files = {source_file(capture, band) for band in capture.moving}
+    return earlier.reference.georeferenced and any(band.file in files for band in earlier.bands)
 
 
 def _described(earlier: Sidecar, capture: Capture) -> str:

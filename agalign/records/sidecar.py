@@ -622,6 +622,12 @@ class Sidecar(_Part):
     checksum: str | None = None
     """SHA-256 of the JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
 
+    @property
+    def own_samples(self) -> set[str]:
+        """The `input_samples` of files that no other capture has: several mosaics may have one reference."""
+        shared = {self.reference.band} if self.reference.georeferenced else set()
+        return {sample for band, sample in self.input_samples.items() if band not in shared}
+
     @classmethod
     def estimated(
         cls,

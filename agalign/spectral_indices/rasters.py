@@ -177,7 +177,7 @@ class IndexRasters(Product):
         Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
         """
         base, label = context.paths.file(""), context.capture.label
-        samples = context.sidecar.input_samples.values()
+        samples = context.sidecar.own_samples
         requested, rasters = chosen_indices(context.settings.write.indices), index_rasters(base)
         earlier = [raster for raster in rasters if raster.name not in {one.name for one in requested}]
         if not (requested or earlier):
@@ -272,7 +272,7 @@ def write_rasters(
     listed: ListedFiles | None = None,
     samples: Collection[str] = (),
 ) -> Iterator[IndexReport]:
-    """Write `base`_<index>.tif and .png of a capture's bands, each atomically; `samples` are `Sidecar.input_samples` of
+    """Write `base`_<index>.tif and .png of a capture's bands, each atomically; `samples` are `Sidecar.own_samples` of
     the capture, for `IndexRaster.is_of_other`.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a

@@ -131,6 +131,16 @@ def test_what_identifies_a_capture(flight: Path, out: Path) -> None:
     assert same({}, captured_at="", capture_id="")
     assert same({"input_samples": {"Green": "0"}}, captured_at="", capture_id="") is False
     assert same({"input_samples": {}}, captured_at="", capture_id="") is None
+    # Several mosaics are aligned onto one reference: their own contents, or their place, tell them apart.
+    green, others = earlier.reference.band, {"input_samples": {**earlier.input_samples, "NIR": "0"}}
+    of_mosaic = {"reference": earlier.reference.model_copy(update={"georeferenced": True})}
+    only_reference = {"input_samples": {green: earlier.input_samples[green], "NIR": "0"}}
+    elsewhere = [band.model_copy(update={"file": f"x/{band.file}"}) for band in earlier.bands]
+    without_tags = {"captured_at": "", "capture_id": ""}
+    assert same(of_mosaic | others, **without_tags)
+    assert same(of_mosaic | only_reference, **without_tags)
+    assert same(of_mosaic | only_reference | {"bands": elsewhere}, **without_tags) is False
+    assert same(only_reference | {"bands": elsewhere}, **without_tags)
 
 
 def test_captures_with_other_options_are_done_again_and_this_is_printed_before(flight: Path, out: Path) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from agalign.batch.earlier_results import outputs_exist
 from agalign.batch.products import PRODUCTS
 from agalign.host.files import write_text
 from agalign.rasters.product import Product, ProductContext, WrittenFile
+from agalign.values.capture import Capture
 
 from ..conftest import raising, seeded, write_capture
 
@@ -103,6 +105,24 @@ def test_a_required_product_that_fails_costs_the_capture(align: Align, monkeypat
     assert (report.state, report.failed_products) == ("done", ("f.histogram.json: cannot be written",))
     assert report.result.not_written == ["histogram"]
     use_products(monkeypatch, *PRODUCTS)
+    assert [align().state for _ in range(2)] == ["done", "kept"]
+
+
+def test_a_file_that_is_changed_while_it_is_read_is_not_kept(align: Align, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a card that is still being copied: the checksum would be that of the complete file."""
+    now = capture_task.align_capture_bands
+
+    def and_changed(capture: Capture, *rest: Any) -> Any:
+        result = now(capture, *rest)
+        path = capture.moving[0].path
+        path.write_bytes(path.read_bytes() + b"\0")
+        return result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(capture_task, "align_capture_bands", and_changed)
+        report = align()
+    assert report.state == "error"
+    assert (report.error or "").endswith(": was changed while it was read; run again")
     assert [align().state for _ in range(2)] == ["done", "kept"]
 
 
