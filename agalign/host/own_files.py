@@ -50,21 +50,24 @@ def has_mark(path: Path, text_starts: tuple[bytes, ...] = ()) -> bool:
     return False
 
 
-def foreign(path: Path, folder: str = "output folder") -> str:
+_OTHER_FOLDER = "choose another output folder with -o"
+
+
+def foreign(path: Path, remedy: str = _OTHER_FOLDER) -> str:
     """Return the message about a file at the path of an output that no command has written."""
-    return f"{path}: was not written by agalign; choose another {folder} with -o"
+    return f"{path}: was not written by agalign; {remedy}"
 
 
-def refuse_foreign(path: Path, text_starts: tuple[bytes, ...] = (), folder: str = "output folder") -> None:
+def refuse_foreign(path: Path, text_starts: tuple[bytes, ...] = (), remedy: str = _OTHER_FOLDER) -> None:
     """Raise ConfigurationError for a file that is not one as `is_own_file`."""
     if path.is_file() and not is_own_file(path, text_starts):
-        raise ConfigurationError(foreign(path, folder))
+        raise ConfigurationError(foreign(path, remedy))
 
 
-def refuse_foreign_pages(out: Path) -> None:
+def refuse_foreign_pages(out: Path, remedy: str = _OTHER_FOLDER) -> None:
     """Raise ConfigurationError for a file with the name of a page or table of a run that no command has written."""
     for name, start in PAGE_STARTS.items():
-        refuse_foreign(out / name, (start,))
+        refuse_foreign(out / name, (start,), remedy)
 
 
 def refuse_to_replace(path: Path, mark: bytes | None) -> None:

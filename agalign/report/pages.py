@@ -50,7 +50,7 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError, and ConfigurationError for a file with the name of a page that no command has written.
     """
-    refuse_foreign_pages(out)
+    refuse_foreign_pages(out, "rename it")
     unreadable: list[str] = []
     facts, flight_map, rows = _captures(out, unreadable.append)
 

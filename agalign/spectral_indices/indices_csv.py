@@ -71,7 +71,7 @@ def read_table(out: Path) -> list[IndexReport]:
 
 def refuse_foreign_table(folder: Path) -> None:
     """Raise ConfigurationError if a folder has a file with the name of the table that no command has written."""
-    refuse_foreign(folder / INDICES_FILE, (PAGE_STARTS[INDICES_FILE],), "folder")
+    refuse_foreign(folder / INDICES_FILE, (PAGE_STARTS[INDICES_FILE],), "choose another folder with -o")
 
 
 def current_rows(out: Path) -> list[IndexReport]:

@@ -291,7 +291,7 @@ def write_rasters(
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and (file := _foreign_file(target)):
-                    raise InputError(foreign(file, "folder"))
+                    raise InputError(foreign(file, "choose another folder with -o"))
                 if not overwrite and (change := listed.problem(target)) and IndexRaster.complete(target) is not None:
                     raise InputError(f"{change}; --overwrite replaces it")
                 statistics = earlier or _write(index, chosen, target, source, reader, samples)

@@ -143,7 +143,7 @@ def test_a_map_of_the_user_is_neither_replaced_nor_removed(tmp_path: Path) -> No
     mine = tmp_path / "flight.geojson"
     mine.write_text('{"type": "FeatureCollection", "features": []}')
     before = mine.read_bytes()
-    with pytest.raises(ConfigurationError, match=r"flight\.geojson: was not written by agalign"):
+    with pytest.raises(ConfigurationError, match=r"flight\.geojson: was not written by agalign; rename it$"):
         write_pages(tmp_path, lambda _: None)
     assert mine.read_bytes() == before
     assert not (tmp_path / "index.html").exists()
