@@ -29,6 +29,7 @@ from agalign.verify.checks import (
 )
 
 from ..builders import grid_px, joint_result, residual_of, texture, whole
+from ..conftest import textured_pair
 
 SIZE = (1280, 960)
 JOINT = joint_result(std_px=0.07)
@@ -242,6 +243,18 @@ def test_an_area_of_another_place_is_found_in_many_windows(share: float) -> None
         shifts = np.where(is_lost.reshape(-1, 1), np.nan, 0.0) * np.ones((1, 2))
         residual = residual_of(112 * grid_px(np.arange(24), np.arange(16)) + 56, shifts)
         assert [issue.code for issue in content_issues(residual, 1.0)] == codes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("displaced_px", [60, 90, 120])
+def test_a_part_of_the_image_that_is_displaced_is_not_aligned(displaced_px: int) -> None:
+    """As of a wall near the camera. 40 % of the windows have no common peak if it is farther than half of a window."""
+    fixed, moving = textured_pair(np.eye(3), 640, 480)
+    part = np.s_[:, 384:]
+    moving[part] = np.roll(moving, displaced_px, axis=0)[part]
+    result = agalign.align(fixed, moving)
+    assert result.status != "aligned"
+    assert geometry.corner_error_px(result.fixed_to_moving, np.eye(3), 640, 480) < 1.0
 
 
 @pytest.mark.parametrize(("columns", "rows", "lost"), [(11, 8, 2), (6, 5, 3), (6, 4, 3), (7, 5, 3), (5, 4, 2)])
