@@ -169,18 +169,21 @@ def _solid_area(cells: NDArray[np.int64], is_lost: NDArray[np.bool_]) -> int:
     rectangle, as an area of another content may be a large part of the image, and a strip as well as a block.
     """
     max_chance = 0.0025  # that scattered windows fill a rectangle of one shape somewhere
-    min_side, min_windows = 2, 8  # smaller areas without a peak are normal
+    # Smaller areas without a peak are normal, also strips: noise hides the structure where there is least of it.
+    min_side, min_windows, min_share_of_strip = 2, 8, 0.15
     count, lost = len(cells), int(is_lost.sum())
     if lost < min_windows:
         return 0
     occupied = np.zeros(cells.max(axis=0) + 1, np.uint8)
     occupied[tuple(cells[is_lost].T)] = 1
-    sizes = np.arange(min_windows, lost + 1)
-    shares = (lost - sizes) / np.maximum(count - sizes, 1)
+    sizes = np.arange(min_windows, min(lost, count - 1) + 1)  # at least one window is outside
+    shares = (lost - sizes) / (count - sizes)
     enough = sizes[count * shares**sizes <= max_chance]  # larger rectangles are less likely
     solid = np.zeros_like(occupied)
     for across in range(min_side, len(occupied) + 1 if len(enough) else 0):
         along = max(min_side, -(-int(enough[0]) // across))
+        if min(across, along) == min_side and across * along < min_share_of_strip * count:
+            along = max(min_side + 1, math.ceil(min_share_of_strip * count / across))
         rectangle, last = np.ones((across, along), np.uint8), (along - 1, across - 1)
         origins = cv2.erode(occupied, rectangle, anchor=(0, 0), borderValue=0)
         solid |= cv2.dilate(origins, rectangle, anchor=last)
