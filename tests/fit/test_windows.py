@@ -61,7 +61,7 @@ def test_small_shifts_are_hardly_attracted_by_whole_pixels(shift_px: float) -> N
         Raster((x + rng.normal(0, 0.1 * x.std(), x.shape)).astype(np.float32), np.ones(x.shape, bool)) for x in images
     )
     shifts_px = FixedWindows(fixed.valid, structure_field(fixed)).residuals(moving).shifts_px
-    assert np.median(shifts_px[:, 0]) == pytest.approx(shift_px, rel=0.12)
+    assert np.median(shifts_px[:, 0]) == pytest.approx(shift_px, rel=0.18)
 
 
 def test_windows_with_too_few_valid_pixels_are_omitted() -> None:
