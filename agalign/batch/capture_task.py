@@ -142,7 +142,8 @@ def estimate(
     began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
     alignments = align_capture_bands(capture, settings, model, progress, read)
     facts_of_input = {"input_samples": input_samples(capture), "input_digests": input_digests(capture)}
-    if changed := [b for b in capture.bands if states.get(b.name) != input_states(capture).get(b.name)]:
+    states_now = input_states(capture)
+    if changed := [b for b in capture.bands if states.get(b.name) != states_now.get(b.name)]:
         raise UnreadableFileError(f"{changed[0].path}: was changed while it was read", "run again")
     progress(capture.reference.name, "writing", 0.0)
     relief, path, parallax = relief_of(alignments), paths.file(PARALLAX_SUFFIX), None

@@ -212,8 +212,8 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     """Return whether a result is of this capture; None if neither tags nor contents decide.
 
     The comparison uses the tags that both have: make, model, serial numbers, capture id and time. Without id and time,
-    the contents of one file must be equal; the other files may have been repaired. Of mosaics, that is not the
-    reference, and a file at the same place suffices.
+    the contents of one file must be equal; the other files may have been repaired. Mosaics may share the
+    reference: another file must be equal or at the same place.
     """
     one, other = earlier.camera, capture.camera
     pairs = (one.make, other.make), (one.model, other.model), (earlier.capture_id, capture.capture_id)

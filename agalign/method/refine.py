@@ -38,8 +38,8 @@ _FINAL_CONVERGED_PX = 0.06
 remaining displacement is smaller than the systematic error."""
 _SYSTEMATIC_STD_PX = 0.06
 """Added in quadrature to the standard errors along x and y: errors that the covariance does not contain, such as a
-bias between two modalities. With it, the errors of descriptors alone at the tie points of sharp images have the
-standard error that they claim (53 bands of two flights and two captures: an RMS of 0.03 to 0.08 px over the image)."""
+bias between two modalities. With this value, descriptors alone claim the errors that they have at tie points of sharp
+images: an RMS of 0.03 to 0.08 px over the image (53 bands of two flights and two captures)."""
 _SEARCH_STEP_PX = 3.0
 """Spacing of the translations that are searched, px of the level: a Gauss-Newton step can bridge it."""
 _PRESELECTION_PATCHES, _CANDIDATE_SHIFTS = 24, 64

@@ -69,7 +69,7 @@ class DisplacementField:
 
     @cached_property
     def _coefficients(self) -> list[NDArray[np.float64]]:
-        """Those of the splines, along x and y, with padding: once for all blocks of an image."""
+        """Coefficients of the splines along x and y, padded: they are calculated once for all blocks of an image."""
         planes = (np.pad(plane, _PADDED_NODES, mode="edge") for plane in np.moveaxis(self.displacements_px, -1, 0))
         return [spline_filter(plane, order=3, mode="nearest") for plane in planes]
 
