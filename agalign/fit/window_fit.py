@@ -145,9 +145,10 @@ def fit_windows(
     robust = Robust(_CAUCHY_SCALES, shift_scale_px, partial(shift_variance_px2, with_shapes=with_shapes))
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
     # Each parameter without a prior takes a degree of freedom from the residuals.
-    components, free = 2 * len(raw.centres_px), count if lens_std_px is None else 0
-    of_noise_px2 = components / (components - free) * estimate.covariance[:count, :count]
-    covariance_px2 = of_noise_px2 + _COMMON_STD_PX**2 * np.eye(count)
+    components, covariance_px2 = 2 * len(raw.centres_px), estimate.covariance[:count, :count]
+    if lens_std_px is None:
+        covariance_px2 = covariance_px2 * components / (components - count)
+    covariance_px2 = covariance_px2 + _COMMON_STD_PX**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
 
 
