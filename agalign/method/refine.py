@@ -34,8 +34,8 @@ other captures contribute to network or rig. Half as many are used while the ste
 _FINAL_OCTAVES = 0.3
 """Range of log2 of their scales: small patches localise better."""
 _FINAL_CONVERGED_PX = 0.06
-"""psi has converged if a step displaces no corner by more than this, px: steps shrink by more than half, so the
-remaining displacement is smaller than the systematic error."""
+"""psi has converged if a step displaces no corner by more than this, px: where the images have structure in common,
+steps shrink by more than half, so the remaining displacement is smaller than the systematic error."""
 _SYSTEMATIC_STD_PX = 0.06
 """Added in quadrature to the standard errors along x and y: errors that the covariance does not contain, such as a
 bias between two modalities. With this value, descriptors alone claim the errors that they have at tie points of sharp
