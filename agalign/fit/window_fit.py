@@ -147,7 +147,7 @@ def fit_windows(
     # Each parameter without a prior takes a degree of freedom from the residuals.
     components, covariance_px2 = 2 * len(raw.centres_px), estimate.covariance[:count, :count]
     if lens_std_px is None:
-        covariance_px2 = covariance_px2 * components / (components - count)
+        covariance_px2 = components / (components - count) * covariance_px2
     covariance_px2 = covariance_px2 + _COMMON_STD_PX**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
 
