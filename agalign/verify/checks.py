@@ -212,7 +212,7 @@ def max_expected_px(std_px: float) -> float:
 
 
 class AliasPeak(NamedTuple):
-    """Another correlation peak than that of the result: (x, y), px of the fixed image, and relative height."""
+    """A correlation peak away from the result: its shift (x, y), px of the fixed image, and its relative height."""
 
     shift_px: tuple[float, float]
     ratio: float

@@ -633,7 +633,7 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
     ("is_lens_known", "height_px", "shown"), [(False, 0, False), (True, 0, True), (False, 2, True)]
 )
 def test_unknown_distortion_of_lenses_is_not_relief(is_lens_known: bool, height_px: float, shown: bool) -> None:
-    """Bands have it in common, as it contains that of the reference; where a rig contains it, the rest is parallax."""
+    """All bands show the distortion of the reference's lens. Where a rig contains it, what bands share is parallax."""
     size_px = 1280, 960
     image = whole(textured_image(*size_px))
     reference = Reference(image)
