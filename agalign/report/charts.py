@@ -1,7 +1,6 @@
 """Drawings of the rig of a flight, and charts of the offsets of its bands over the captures, in SVG units."""
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -83,17 +82,16 @@ def hues_of(bands: Sequence[str]) -> dict[str, float]:
     return hues
 
 
-def drifts_of(cameras: Mapping[tuple[str, str], CameraOffsets]) -> list[dict[str, Any]]:
+def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[dict[str, Any]]:
     """Return a chart of the offsets, px, over the captures in the order of time, for each camera with three captures or
-    more, given by model and unit.
+    more, given by name.
 
     Each has `title`, `full_px` at the upper end of the axis, `ends`, which are the labels of the first and the last
     capture, and `lines`: `name` and `hue` of a band, and `points` of an SVG polyline for each sequence of captures in
     which it is known.
     """
-    result, units = [], Counter(model for model, _ in cameras)
-    for (model, unit), known in cameras.items():
-        camera = model if units[model] == 1 else f"{model} {unit}".strip()
+    result = []
+    for camera, known in cameras.items():
         order = sorted(range(len(known.labels)), key=known.labels.__getitem__)
         offsets = [known.offsets_px[i] for i in order]
         names = list(dict.fromkeys(name for of_capture in offsets for name in of_capture))

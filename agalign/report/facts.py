@@ -64,7 +64,7 @@ class FlightFacts:
         """(label, reason) of the captures by requested index that was not written."""
         self.statuses: Counter[str] = Counter()
         """Number of captures by status as the page shows it: `ok_by_prediction` is not `ok`."""
-        self.cameras: dict[tuple[str, str], CameraOffsets] = {}
+        self._units: dict[tuple[str, str], CameraOffsets] = {}
         """By name of the model, and unit."""
         self.seconds: dict[str, float] = {}
         """Processing time of each capture, by label."""
@@ -79,6 +79,15 @@ class FlightFacts:
         self._lattices: dict[bytes, int] = {}
         """Centres of windows, which many pairs share, and their index, of the current part of the details."""
         self._first_lattice = 0
+
+    @property
+    def cameras(self) -> dict[str, CameraOffsets]:
+        """Offsets by camera: the name of its model, with the unit where the run has several of the model."""
+        units = Counter(model for model, _ in self._units)
+        return {
+            model if units[model] == 1 else f"{model} {unit}".strip(): offsets
+            for (model, unit), offsets in self._units.items()
+        }
 
     def add(self, label: str, sidecar: Sidecar, indices: Sequence[IndexReport] = ()) -> None:
         """Add a capture, given its label, and its indices. Raises OutputError."""
@@ -106,7 +115,7 @@ class FlightFacts:
             self._flush_details()
 
     def _count(self, facts: dict[str, Any], unit: str) -> None:
-        label, camera = facts["label"], self.cameras.setdefault((facts["camera"], unit), CameraOffsets())
+        label, camera = facts["label"], self._units.setdefault((facts["camera"], unit), CameraOffsets())
         self.statuses[facts["shown"]] += 1
         self.seconds[label] = facts["seconds"]
         self.placed += facts["position"] is not None

@@ -223,6 +223,23 @@ def test_a_capture_that_is_ok_by_prediction_is_not_shown_as_ok(out: Path) -> Non
 
 
 @pytest.mark.slow
+def test_cameras_have_their_names_with_the_unit_if_there_are_several_of_a_model(out: Path) -> None:
+    first, second = (out / "0000SET" / "000" / f"IMG_000{number}.json" for number in (1, 2))
+    camera = read_json(first)["camera"]
+    name = f"{camera['make']} {camera['model']}"
+
+    def named() -> str:
+        write_pages(out, pytest.fail)
+        return (out / "index.html").read_text(encoding="utf-8").partition("2 captures of ")[2].partition(" &middot;")[0]
+
+    assert named() == name
+    units = [camera | {"serial": serial} for serial in ("7", "9")]
+    for sidecar, unit in zip((first, second), units, strict=True):
+        change(sidecar, camera=unit)
+    assert named() == f"{name} 7, {name} 9"
+
+
+@pytest.mark.slow
 def test_indices_that_were_not_written_are_named_with_the_reason(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sidecar = out / "0000SET" / "000" / "IMG_0002.json"
     contents = read_json(sidecar)
@@ -489,7 +506,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     labels = [(f"2026-06-21T10:00:{i:02d}", f"{i:02d}") for i in range(7)]
     # In the order of time, whatever that of the captures is.
     known = CameraOffsets(labels[::-1], offsets[::-1])
-    (drift,) = drifts_of({("camera", ""): known})
+    (drift,) = drifts_of({"camera": known})
     assert drift["ends"] == ("00", "06")
     assert drift["full_px"] == pytest.approx(15, abs=0.01)
     assert [len(line["points"]) for line in drift["lines"]] == [2, 1]
@@ -498,9 +515,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
     # Along the same baseline in the other direction, a band is drawn next to the first, not opposite to it.
     assert np.sign(np.diff(heights[0])).tolist() == np.sign(np.diff(heights[1][:3] + heights[1][4:])).tolist()
-    assert drifts_of({("camera", ""): CameraOffsets(labels[:2], offsets[:2])}) == []
-    titles = [chart["title"] for chart in drifts_of({("A", "1"): known, ("A", "2"): known, ("B", "3"): known})]
-    assert titles == [f"{camera} from capture to capture" for camera in ("A 1", "A 2", "B")]
+    assert drifts_of({"camera": CameraOffsets(labels[:2], offsets[:2])}) == []
 
 
 @pytest.mark.slow
