@@ -152,7 +152,10 @@ class _Table:
         return bands, np.minimum(1 / np.sqrt(information), 1.0), result
 
     def cross_validated_px(self, factors: Sequence[Factor]) -> Array:
-        """Return (bands,) the RMS error of predictions from the other bands, in captures left out of the fit."""
+        """Return (bands,) the RMS error of predictions from the other bands, in captures left out of the fit.
+
+        A band that no capture has with another one is predicted by the flight's mean.
+        """
         squares_px2, count = np.zeros(self.weights.shape), len(self.weights)
         max_folds = 12  # more take longer and change the errors little
         for folds in (min(count, max_folds), count):
@@ -169,8 +172,11 @@ class _Table:
                 result = capture_factors(design, differences, other_weights).mean
                 error_px = differences[:, j] - (design[j] @ result.T).transpose(2, 0, 1)
                 squares_px2[is_left_out, j] = (error_px**2).sum(axis=(1, 2))
-        counts = (self.weights > 0).sum(axis=0)
-        mean_px2 = (squares_px2 * (self.weights > 0)).sum(axis=0) / counts
+        is_known = self.weights > 0
+        has_others = is_known & (is_known.sum(axis=1, keepdims=True) > 1)
+        is_compared = np.where(has_others.any(axis=0), has_others, is_known)
+        counts = is_compared.sum(axis=0)
+        mean_px2 = (squares_px2 * is_compared).sum(axis=0) / counts
         # The final rig has more captures than a fit without a fold, at least one: the error variance is proportional to
         # 1 + 1 / n.
         of_final_px2 = mean_px2 * (1 + 1 / counts) / (1 + 1 / np.maximum(counts - 1, 1))

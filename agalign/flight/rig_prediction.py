@@ -192,11 +192,13 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Pre
     """Predict a band from the estimate of the capture's factors with the smallest standard error, px.
 
     That is the leave-one-out error of the basis for learned captures with similar gaps, or the difference between
-    the captures used if that is larger. A gap of more than _MAX_GAP_RATIO times those of all learned captures is not
+    the captures used if that is larger; if the distance is not interpolated over the altitude, with the error by an
+    altitude that no learned capture has. A gap of more than _MAX_GAP_RATIO times those of all learned captures is not
     validated: the flight's mean remains.
     """
     min_for_altitude = 6  # with fewer captures, the basis with the smallest error would be selected by chance
     design, results = rig.design(band), []
+    altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
     for basis in get_args(Basis)[: 3 if len(rig.captures) >= min_for_altitude else 2]:
         estimate, tests = estimated_factors(known, rig.captures, basis), _leave_one_out(rig, band, basis)
         if estimate is not None and tests and estimate[2] <= _MAX_GAP_RATIO * tests[-1][0]:
@@ -204,12 +206,12 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Pre
             similar = [square for other_gap, square in tests if other_gap <= _MAX_GAP_RATIO * gap]
             squares = similar if len(similar) >= MIN_CAPTURES else [square for _, square in tests[:MIN_CAPTURES]]
             mean_px2 = float(expected_square(np.mean(squares), len(squares)))
+            other_px2 = 0.0 if basis == "altitude_m" else altitude_px**2
             source: PredictionSource = "neighbours" if basis != "flight" and (design @ factors).any() else "flight"
-            results.append((max(mean_px2, float(((design @ std) ** 2).sum())), factors, source))
-    of_mean: tuple[float, Array, PredictionSource] = 0.0, np.zeros(FACTORS), "flight"
+            results.append((max(mean_px2, float(((design @ std) ** 2).sum())) + other_px2, factors, source))
+    of_mean: tuple[float, Array, PredictionSource] = altitude_px**2, np.zeros(FACTORS), "flight"
     variance_px2, factors, source = min(results, key=itemgetter(0), default=of_mean)
-    altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
-    error_px = float(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2 + altitude_px**2))
+    error_px = float(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2))
     return rig.mapping(band, factors), source, error_px
 
 

@@ -170,6 +170,30 @@ def test_a_capture_after_the_learned_ones_may_have_drifted_further() -> None:
         assert error < 1.5 * std
 
 
+def test_an_altitude_between_learned_ones_does_not_count_as_unseen() -> None:
+    """The distance is interpolated over the altitude, in captures that are not in its order."""
+    altitudes_m = np.random.default_rng(0).permutation(np.arange(50.0, 71.0))
+    hilly = [
+        observation(10.0 * k, 2000 / m, noise=0.03, seed=k, altitude_m=m) for k, m in enumerate(altitudes_m.tolist())
+    ]
+    rig = learn_rig(hilly, SIZE, BASELINES)
+    for altitude_m in (54.5, 58.5, 64.5):
+        known = Observation(55.0, {}, {}, altitude_m)
+        error, std = error_px(rig, "NIR", known, mappings(2000 / altitude_m)["NIR"])
+        assert error < 0.1
+        assert std < 0.4
+
+
+def test_a_band_without_others_in_its_capture_says_nothing_of_predictions_by_others() -> None:
+    captures = flight(16)
+    alone = observation(100.0, 10.0, noise=0.03, seed=100)
+    alone = replace(alone, mappings={"Red": alone.mappings["Red"]}, std_px={"Red": alone.std_px["Red"]})
+    without, with_it = (learn_rig(some, SIZE, {}).from_bands_px for some in (captures, [*captures, alone]))
+    assert with_it == pytest.approx(without, rel=0.1)
+    only_red = [replace(alone, seconds=float(k)) for k in range(4)]
+    assert learn_rig(only_red, SIZE, {}).from_bands_px["Red"] > 0
+
+
 def test_factors_are_not_those_of_captures_far_in_time_at_the_same_altitude() -> None:
     captures = [CaptureFactors(60.0 * k, 100.0 + k, None, (0.1 * k, 0.0, 0.0, 1.0, 1.0)) for k in range(8)]
     mean = np.zeros(5)
