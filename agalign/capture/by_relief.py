@@ -174,21 +174,22 @@ def _consistent_bands(
         model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
         return model if model is not None and are_of_lenses(model.baselines, layout) else None
 
-    def median_scale_px(bands: Sequence[int]) -> float:
-        model = adjusted(bands, None)
-        return math.inf if model is None else float(np.median(model.scales_px))
+    def without(foreign: int) -> tuple[float, int]:
+        """Return the residual scale without a band, px, infinite if no model exists, and the windows of the band."""
+        model, own = adjusted([b for b in kept if b != foreign], None), int((windows.weights[:, foreign] > 0).sum())
+        return math.inf if model is None else float(np.median(model.scales_px)), own
 
     kept = list(range(windows.shifts_px.shape[1]))
     model = adjusted(kept, lens_std)
     while len(kept) > _MIN_BANDS:
         if model is None:
-            worst = int(np.argmin([median_scale_px([b for b in kept if b != foreign]) for foreign in kept]))
+            kept.remove(min(kept, key=without))
         else:
             worst = int(model.scales_px.argmax())
             others_px = float(np.median(np.delete(model.scales_px, worst)))
             if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
                 break
-        kept.pop(worst)
+            kept.pop(worst)
         model = adjusted(kept, lens_std)
     return None if model is None else (kept, model)
 
@@ -202,6 +203,8 @@ class _Band:
     baseline: tuple[float, float] = (0.0, 0.0)
     covariance_px2: NDArray[np.float64] | None = None
     """(8, 8) of the corners of the plane, or (12, 12) with the lens shapes; None before it is fitted."""
+    baseline_std: float = 0.0
+    """Standard error of the fitted baseline, px per px of parallax."""
 
     @property
     def name(self) -> str:
@@ -217,7 +220,8 @@ class _Band:
         """Apply a fit to windows. Raises GeometryError."""
         assert fit.baseline is not None
         x, y = fit.baseline.tolist()
-        return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y), covariance_px2=fit.covariance_px2)
+        plane = fit.applied_to(self.plane)
+        return _Band(self.refined, plane, (x, y), fit.covariance_px2, fit.baseline_std)
 
     @property
     def joint(self) -> JointResult:
@@ -244,7 +248,7 @@ class _Band:
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
         pair, residual = self.refined.pair, held_out.residual
         assert self.covariance_px2 is not None
-        error = mapping_error(pair, mapping, self.covariance_px2, residual, self.plane.field)
+        error = mapping_error(pair, mapping, self.covariance_px2, residual, self.plane.field, self.baseline_std)
         return Candidate(pair, mapping, error, residual, self.joint, held_out, held_out_p95_px=p95_px)
 
 
@@ -398,7 +402,8 @@ class _Estimate:
         fitted = fit_in_rounds(start, fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None
-        return _Band(band, fitted[0].without_parallax, fitted[0].parallax.baseline, fitted[1].covariance_px2)
+        plane, fit = fitted[0].without_parallax, fitted[1]
+        return _Band(band, plane, fitted[0].parallax.baseline, fit.covariance_px2, fit.baseline_std)
 
     def of_other_bands(self, others: Sequence[RefinedBand]) -> dict[str, Candidate]:
         """Return the candidates of bands of the same reference where windows allow it, except those of the estimate: a
@@ -439,9 +444,10 @@ def _with_field_on_relief(candidate: Candidate) -> Candidate:
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
     if displacement is None or displacement.field is None:
         return candidate
-    assert candidate.error.covariance_px2 is not None
     with_field = replace(mapping, field=displacement.field)
-    error = mapping_error(pair, with_field, candidate.error.covariance_px2, candidate.residual, mapping.field)
+    covariance_px2, baseline_std = candidate.error.covariance_px2, candidate.error.baseline_std
+    assert covariance_px2 is not None
+    error = mapping_error(pair, with_field, covariance_px2, candidate.residual, mapping.field, baseline_std)
     p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.held_out.p95_px}
     of_field = displacement.held_out
     result = replace(candidate, mapping=with_field, error=error, other_residual=of_field, held_out_p95_px=p95_px)

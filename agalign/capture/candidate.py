@@ -131,6 +131,7 @@ def mapping_error(
     covariance_px2: NDArray[np.float64],
     residual: Residual,
     lens_field: DisplacementField | None = None,
+    baseline_std: float = 0.0,
 ) -> MappingError:
     """Return the error of a mapping that was estimated on the images of a pair.
 
@@ -152,6 +153,7 @@ def mapping_error(
         field_std_px=spread_px,
         relief_std_px=0.0 if mapping.parallax is not None else pair.relief_std_px,
         parallax=mapping.parallax,
+        baseline_std=baseline_std,
     )
 
 

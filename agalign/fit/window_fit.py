@@ -15,7 +15,7 @@ weights reduce the influence of wrong correlation peaks and of windows across de
 
 Two ambiguities are removed. A plane a + b x + c y added to z is equivalent to other homographies of all bands: z is 0
 on the plane that contains most windows. The scale of z is free: the longest baseline has length 1. If the lens layout
-is known, positive parallax is nearer to the camera.
+is known, positive parallax is nearer to the camera, else its mean is positive: most objects are nearer than the plane.
 """
 
 import math
@@ -85,6 +85,8 @@ class WindowFit:
     """(4,) coefficients of the lens shapes; None if they were not fitted."""
     baseline: Array | None = None
     """(2,) t_b; None without parallax."""
+    baseline_std: float = 0.0
+    """Standard error of t_b, x and y together, px per px of parallax."""
 
     @property
     def max_px(self) -> float:
@@ -145,18 +147,19 @@ def fit_windows(
     robust = Robust(_CAUCHY_SCALES, shift_scale_px, partial(shift_variance_px2, with_shapes=with_shapes))
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
     # Each parameter without a prior takes a degree of freedom from the residuals.
-    components, covariance_px2 = 2 * len(raw.centres_px), estimate.covariance[:count, :count]
+    components, covariance = 2 * len(raw.centres_px), estimate.covariance
     if lens_std_px is None:
-        covariance_px2 = components / (components - count) * covariance_px2
-    covariance_px2 = covariance_px2 + _COMMON_STD_PX**2 * np.eye(count)
-    return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
+        covariance = components / (components - count) * covariance
+    return _window_fit(estimate.mean, estimate.residuals, size_px, covariance, count)
 
 
-def _window_fit(mean: Array, residuals_px: Array, size_px: tuple[int, int], covariance_px2: Array) -> WindowFit:
-    """Split parameters into corners, lens shapes and baseline; the covariance contains no baseline."""
-    corners_px, lens_px, baseline = np.split(mean, [8, len(covariance_px2)])
+def _window_fit(mean: Array, residuals_px: Array, size_px: tuple[int, int], covariance: Array, count: int) -> WindowFit:
+    """Split parameters and their covariance into corners and lens shapes, `count` together, and baseline."""
+    corners_px, lens_px, baseline = np.split(mean, [8, count])
     lens, t = (None if not len(part) else part for part in (lens_px, baseline))
-    return WindowFit(corners_px, residuals_px, size_px, covariance_px2, lens, t)
+    covariance_px2 = covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
+    baseline_std = math.sqrt(np.trace(covariance[count:, count:]))
+    return WindowFit(corners_px, residuals_px, size_px, covariance_px2, lens, t, baseline_std)
 
 
 def _with_parallax(design: Array, parallax_px: Array) -> Array:
@@ -378,11 +381,10 @@ def adjust(
         residuals = np.where(windows.weights.T > 0, by_band.residuals, np.nan)
         scales = np.array([shift_scale_px(r[np.isfinite(r)]) for r in residuals])
         weights = windows.weights * np.nan_to_num(cauchy_weights(residuals.T, _CAUCHY_SCALES * scales))
-    if layout is not None and np.sum(baselines * layout) < 0:
+    if (parallax.mean() if layout is None else np.sum(baselines * layout)) < 0:
         baselines, parallax = -baselines, -parallax
-    covariances = by_band.covariance[:, :count, :count] + _COMMON_STD_PX**2 * np.eye(count)
-    of_bands = zip(np.hstack([smooth, baselines]), residuals, covariances, strict=True)
-    return Adjustment([_window_fit(mean, r, size_px, covariance) for mean, r, covariance in of_bands], parallax)
+    of_bands = zip(np.hstack([smooth, baselines]), residuals, by_band.covariance, strict=True)
+    return Adjustment([_window_fit(mean, r, size_px, covariance, count) for mean, r, covariance in of_bands], parallax)
 
 
 def are_of_lenses(baselines: Array, layout: Array | None) -> bool:

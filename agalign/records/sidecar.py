@@ -229,7 +229,7 @@ class ErrorPart(_Part):
     relief_std_px: Number4 = 0.0
     """Spread of the parallax that a mapping without it lacks, where no window is near."""
     baseline_std: Number6 = 0.0
-    """Standard error of a predicted baseline, px per px of parallax."""
+    """Standard error of the baseline, px per px of parallax."""
     moved: tuple[MovedArea, ...] = ()
     """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
 

@@ -80,7 +80,7 @@ class MappingError:
     parallax: Parallax | None = None
     """Parallax of the mapping, with its standard error."""
     baseline_std: float = 0.0
-    """Standard error of the baseline of a prediction, x and y together, px per px of parallax."""
+    """Standard error of the baseline, x and y together, px per px of parallax."""
     moved: tuple[MovedArea, ...] = ()
     """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
 

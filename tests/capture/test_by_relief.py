@@ -22,6 +22,7 @@ from agalign.capture.by_relief import (
     MIN_PARALLAX_PX,
     UnderRelief,
     _common_parallax_px,
+    _consistent_bands,
     _decreases_shifts,
     _Estimate,
     _is_relief_accepted,
@@ -36,6 +37,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.displacement_field import DisplacementEstimator, DisplacementResult
+from agalign.fit.window_fit import WindowShifts
 from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded
@@ -212,6 +214,7 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
         assert np.median(errors) < 0.2
         assert np.percentile(errors, 90) < 0.6
         assert np.percentile(plane, 90) > 3
+        assert 0 < alignment.error.baseline_std < 0.05
         # Without a rig, lens shapes are fitted: their errors are part of the covariance, not added to it.
         assert (alignment.error.covariance_px2.shape, alignment.error.lens_std_px) == ((12, 12), None)
         # The reported residual is measured with the relief from the other bands.
@@ -556,6 +559,23 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
     result = aligned_by_relief(without_layout(candidates), "auto")[0]
     assert len(result) == len(MOVING)
     assert boxes.correlation(result["NIR"].mapping) < -0.5
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CABD", "CDAB"])
+def test_bands_with_few_windows_leave_the_parallax_to_the_others(candidates: Sequence[RefinedBand], order: str) -> None:
+    """In any order: without one of two such bands, there is no model either."""
+    rng = np.random.default_rng(1)
+    points = grid_px(np.arange(24, 620, 32), np.arange(24, 460, 32))
+    parallax_px = np.where(rng.random(len(points)) < 0.3, 8.0, 0.0)[:, None]
+    baselines = {"A": (1.0, 0.0), "B": (0.1, 0.8), "C": (0.8, 0.7), "D": (-0.5, 0.5)}
+    known = {b: parallax_px * np.array(t) + rng.normal(0, 0.05, points.shape) for b, t in baselines.items()}
+    for band in "CD":
+        known[band][rng.permutation(len(points))[15:]] = np.nan
+    shifts_px = np.stack([known[b] for b in order], axis=1)
+    windows = WindowShifts(points, points, shifts_px, np.isfinite(shifts_px[..., 0]).astype(float))
+    group = [with_pair(candidates[0], layout=baselines[b]) for b in order]
+    kept, _ = _consistent_bands(windows, group)
+    assert {order[k] for k in kept} == {"A", "B"}
 
 
 def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> None:

@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, parallax_of
+from agalign.fit.window_fit import (
+    Adjustment,
+    BaselinePrior,
+    WindowShifts,
+    adjust,
+    are_of_lenses,
+    fit_windows,
+    parallax_of,
+)
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.lens_shapes import lens_std_px
@@ -100,8 +108,34 @@ def test_the_layout_determines_only_the_sign() -> None:
     rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
     assert_recovered(adjust(shifts(), SIZE, rough))
     assert_recovered(adjust(shifts(), SIZE, -BASELINES), sign=-1)
-    model = adjust(shifts(), SIZE)
-    assert_recovered(model, sign=1 if (model.baselines * BASELINES).sum() > 0 else -1)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_without_a_layout_most_objects_are_nearer_than_the_plane(sign: int) -> None:
+    """Not by the sign of a singular vector, which is that of the linear algebra library."""
+    model = adjust(replace(shifts(), shifts_px=PLANES + sign * HEIGHTS[:, None, None] * BASELINES), SIZE)
+    np.testing.assert_allclose(model.baselines, sign * BASELINES, atol=0.02)
+    assert np.percentile(np.abs(model.parallax_px - HEIGHTS), 75) < 0.15
+
+
+def test_the_error_of_a_baseline_is_that_of_repeated_fits() -> None:
+    """Of a band that is fitted alone under a relief, and of all bands together."""
+    of_windows = HEIGHTS.reshape(-1, len(np.unique(POINTS[:, 0]))).astype(np.float32)
+    row, column = (
+        ((at - 12) // 24).clip(0, n - 1) for at, n in zip(np.indices(SIZE[::-1]), of_windows.shape, strict=True)
+    )
+    relief = Relief(of_windows[row, column], np.ones(SIZE[::-1], np.float32))
+    under = PixelMapping(np.eye(3)).with_parallax(Parallax(relief, tuple(BASELINES[3])))
+    baselines, stds = [], []
+    for seed in range(60):
+        noise_px = np.random.default_rng(seed).normal(0, 0.3, (len(POINTS), 4, 2))
+        together = adjust(replace(shifts(), shifts_px=HEIGHTS[:, None, None] * BASELINES + noise_px), SIZE, BASELINES)
+        alone = fit_windows(under, residual_of(POINTS, noise_px[:, 3]), SIZE, baseline=BaselinePrior())
+        fits = [alone, together.fits[3]]
+        baselines.append([fit.baseline for fit in fits])
+        stds.append([fit.baseline_std for fit in fits])
+    rms = np.sqrt(np.var(baselines, axis=0).sum(axis=1))
+    np.testing.assert_allclose(np.mean(stds, axis=0), rms, rtol=0.3)
 
 
 def lens_fields() -> np.ndarray:
