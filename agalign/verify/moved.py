@@ -18,7 +18,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from agalign.pixels.structure import Field, paraboloid_peaks
 from agalign.values.image import FloatImage, Mask
@@ -155,14 +157,18 @@ def _found(pair: _Pair, origins_px: NDArray[np.int64]) -> _Windows:
     """
     if not len(origins_px):
         return _Windows(origins_px, origins_px)
-    cells = origins_px // _STEP_PX
-    is_black = cells.sum(axis=1) % 2 == 0
-    apart = np.abs(cells[:, None] - cells[None]).max(axis=-1)
-    is_first = is_black | ~((apart == 1) & is_black[None]).any(axis=1)
+    is_black = (origins_px // _STEP_PX).sum(axis=1) % 2 == 0
+    is_first = is_black | ~_are_near(origins_px, origins_px[is_black], _STEP_PX)
     first = _shifted_windows(pair, origins_px[is_first])
-    near = np.abs(cells[:, None] - (first.origins_px // _STEP_PX)[None]).max(axis=-1) <= _WINDOW_PX // _STEP_PX
-    second = _shifted_windows(pair, origins_px[~is_first & near.any(axis=1)])
+    second = _shifted_windows(pair, origins_px[~is_first & _are_near(origins_px, first.origins_px, _WINDOW_PX)])
     return _Windows(*(np.concatenate(both) for both in zip(first, second, strict=True)))
+
+
+def _are_near(points: NDArray[np.int64], others: NDArray[np.int64], distance: int) -> Mask:
+    """Return True (n,) for points (n, 2) up to a distance from any others (m, 2), in the maximum norm."""
+    if not len(others):
+        return np.zeros(len(points), bool)
+    return np.asarray(cKDTree(others).query(points, p=np.inf)[0] <= distance)
 
 
 def _shifted_windows(pair: _Pair, origins_px: NDArray[np.int64]) -> _Windows:
@@ -204,8 +210,10 @@ def _groups(windows: _Windows) -> Iterator[_Windows]:
     """Yield the groups of adjacent windows with the same shift, as far as they are large enough."""
     if not len(windows.origins_px):
         return
-    distance_px, difference_px = (np.abs(v[:, None] - v[None]).max(axis=-1) for v in windows)
-    count, labels = connected_components((distance_px <= _WINDOW_PX) & (difference_px <= _SAME_PX), directed=False)
+    places = np.hstack([windows.origins_px / _WINDOW_PX, windows.shifts_px / _SAME_PX])
+    pairs = cKDTree(places).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    adjacent = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(places), len(places)))
+    count, labels = connected_components(adjacent, directed=False)
     for label in range(count):
         group = _Windows(windows.origins_px[labels == label], windows.shifts_px[labels == label])
         if len(group.origins_px) >= _MIN_WINDOWS:
@@ -241,16 +249,15 @@ def _refined(
     x, y = np.median(group.shifts_px, axis=0).round().astype(int).tolist()
     known: dict[tuple[int, int], FloatImage] = {}
     steps = -1, 0, 1
-    for _ in range(3):  # at most, from a shift measured at every second pixel
+    while True:  # few steps, from a shift measured at every second pixel
         for shift in ((x + dx, y + dy) for dy in steps for dx in steps):
             if shift not in known:
                 known[shift] = pair.under(shift, area)
         means = np.array([[known[x + dx, y + dy][where].mean() for dx in steps] for dy in steps], np.float64)
+        if not means.max() > means[1, 1]:
+            return np.array([x, y]) + paraboloid_peaks(means[None])[0], known[x, y]
         row, column = divmod(int(means.argmax()), 3)
-        if (row, column) == (1, 1):
-            break
         x, y = x + column - 1, y + row - 1
-    return np.array([x, y]) + paraboloid_peaks(means[None])[0], known[x, y]
 
 
 def _outlined(

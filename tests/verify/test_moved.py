@@ -1,5 +1,8 @@
 """Areas that moved are found where they are, and only there."""
 
+import tracemalloc
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from agalign.pixels.structure import structure_field
 from agalign.values.image import Mask, Raster
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.moved import moved_areas
+from agalign.verify.moved import _are_near, _groups, _refined, _Windows, moved_areas
 
 from ..builders import texture, whole
 
@@ -111,6 +114,30 @@ def test_the_shift_of_an_object_is_searched_up_to_80_px() -> None:
     fixed, _ = placed(GROUND, OBJECT[:100, :100], 205, 173)
     (area, *_) = areas_of(fixed, placed(GROUND, OBJECT[:100, :100], 133, 223)[0])
     np.testing.assert_allclose(area.shift_px, (-72, 50), atol=0.3)
+
+
+@pytest.mark.parametrize("start_px", [0, 3, 7])
+def test_the_shift_is_refined_from_the_median_of_windows_far_from_it(start_px: int) -> None:
+    def agreement(shift_px: tuple[int, int], area: object) -> np.ndarray:
+        return np.full((4, 4), np.exp(-(np.hypot(shift_px[0] - 6.3, shift_px[1]) ** 2) / 50))
+
+    windows = _Windows(np.zeros((1, 2), np.int64), np.array([[start_px, 0]]))
+    shift_px, _ = _refined(SimpleNamespace(under=agreement), windows, np.s_[:, :], np.ones((4, 4), bool))
+    np.testing.assert_allclose(shift_px, (6.3, 0.0), atol=0.02)
+
+
+def test_the_memory_of_many_windows_is_not_that_of_all_pairs() -> None:
+    rng = np.random.default_rng(0)
+    origins_px = 16 * np.stack(np.divmod(np.arange(5000), 100), axis=1)
+    shifts_px = 2 * rng.integers(-20, 20, (5000, 2))
+    shifts_px[1000:1010] = 8, 4
+    tracemalloc.start()
+    groups = list(_groups(_Windows(origins_px, shifts_px)))
+    assert _are_near(origins_px, origins_px[::3], 16).all()
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert any({*range(1000, 1010)} <= {*(g.origins_px @ [100, 1] // 16).tolist()} for g in groups)
+    assert peak_bytes < 20e6
 
 
 def test_an_area_of_a_large_mosaic_has_a_mask_of_limited_size() -> None:
