@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -61,10 +62,15 @@ def test_channels_are_first_or_last() -> None:
 
 
 def test_aligned_input_is_returned_unchanged() -> None:
-    fixed, moving = textured_pair(np.eye(3))
-    result = agalign.align(fixed, moving)
-    assert result.status == "aligned"
+    """A displacement field that only fits noise would resample it; a small distortion is corrected."""
+    fixed = textured_image(400, 320, 1)
+    noisy = fixed.max() - fixed + np.random.default_rng(1).normal(0, 0.02 * np.ptp(fixed), fixed.shape)
+    result = agalign.align(fixed, noisy)
+    assert (result.status, result.geometry) == ("aligned", "homography")
     np.testing.assert_array_equal(result.fixed_to_moving, np.eye(3))
+    y, x = np.indices(fixed.shape, np.float32)
+    bent = cv2.remap(np.float32(fixed), x + 0.15 * np.sin(x / 60), y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    assert agalign.align(fixed, bent).geometry == "field"
 
 
 HOPELESS: dict[str, Callable[[], np.ndarray]] = {

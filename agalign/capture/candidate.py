@@ -19,7 +19,7 @@ from agalign.values.image import Raster, Tile
 from agalign.values.issues import BY_PARALLAX, OTHER_GEOMETRY, PREDICTED_WITH, SEED_ASKED_FOR, UNREADABLE, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, decrease_in_standard_errors
 from agalign.verify.checks import is_unchanged, issues_of, seed_fits
 from agalign.verify.coverage import pixels_in_frame, points_in_frame
 
@@ -193,14 +193,15 @@ class RefinedBand:
         """Yield the homography, then the same with a displacement field if that passes too.
 
         A field is fitted if parallax may cause all issues of the homography, or if there are none and no rig contains
-        the distortion of the lenses; with `use` "always" also if one does, with "never" not at all.
+        the distortion of the lenses; with `use` "always" also if one does, with "never" not at all. Input that is
+        aligned already only gets a field that improves it.
         """
         band = self._unchanged_if_aligned
         joint, verified = band.joint, band.verified
         plane = Candidate.of(verified, joint)
         is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not self.pair.has_rig))
         if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
-            yield from _with_field(plane, verified, joint)
+            yield from _with_field(plane, verified, joint, is_aligned_input=band is not self)
         else:
             yield plane
 
@@ -225,10 +226,14 @@ class RefinedBand:
         return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
 
 
-def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
+def _with_field(
+    plane: Candidate, warped: WarpedPair, joint: JointResult, *, is_aligned_input: bool
+) -> Iterator[Candidate]:
     """Yield the homography with the p95 of both geometries, then the same with a displacement field, verified by
-    windows that it is not fitted to; without it if it increases their p95 too much, or if only the homography passes.
+    windows that it is not fitted to; without it if it increases their p95 too much, or if only the homography passes,
+    or if it is given by the files, passes, and the field decreases the shifts by no more than chance.
     """
+    min_decrease = 4.0  # standard errors, as that of a relief
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
     if displacement is None:
@@ -236,7 +241,9 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
         return
     p95_px: dict[Geometry, float] = {"homography": displacement.before.p95_px, "field": displacement.held_out.p95_px}
     yield replace(plane, held_out_p95_px=p95_px)
-    if displacement.field is None:
+    decrease = decrease_in_standard_errors(displacement.before, displacement.held_out)
+    is_chance = is_aligned_input and not plane.issues and decrease < min_decrease
+    if displacement.field is None or is_chance:
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of(displaced, joint, displacement.held_out)
