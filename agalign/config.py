@@ -250,7 +250,7 @@ class CheckSettings(SettingsModel):
 
     # The limits of the checks are constants in `verify`.
 
-    accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
+    accept_predicted_px: Annotated[float, Field(ge=0, le=1e6), Option("accept_predicted")] = 1.0
     """Largest expected error, px of the band's file, of a predicted band that indices may use."""
 
 

@@ -155,7 +155,8 @@ def rendered_sidecar(
         update={
             "bands": bands,
             "status": capture_status(bands, capture.missing_bands, accept_predicted_px),
-            # Captures with further bands may have been added since the estimation.
+            # Captures with further bands or serial numbers may have been added since the estimation.
+            "camera": capture.camera,
             "missing_bands": list(capture.missing_bands),
             "unreadable_bands": {name: str(why) for name, why in capture.unreadable_bands.items()},
             "accept_predicted_px": accept_predicted_px,

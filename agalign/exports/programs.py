@@ -137,6 +137,11 @@ def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *
             raise ConfigurationError(
                 f"{out}: has stacks only; run 'agalign' with --layout bands or both into it, and export again"
             )
+        if capture.result.write_options.get("format") == "cog":
+            raise ConfigurationError(
+                f"{out}: has cloud-optimised files, without the tags of the camera that other programs need; "
+                "run 'agalign' with --format gtiff into it, and export again"
+            )
         for file in files:
             source = check_inside(file, out)
             target = images / file_name(file.relative_to(out).as_posix(), taken)

@@ -61,11 +61,11 @@ def render_fingerprint(capture: Capture, write: WriteSettings, check: CheckSetti
         if b.radiometry is not None:
             # That of the pixels is not known before they are read, and they are compared by themselves.
             errors = [(e.name, e.std_percent, e.state) for e in b.radiometry.errors if e.name != BRIGHT]
-            calibration = b.radiometry.quantity, b.radiometry.gain, errors
+            calibration = b.radiometry.quantity, b.radiometry.gain, errors, b.implausible
         georeference = None if b.georeference is None else b.georeference.transform
         facts.append((b.name, calibration, georeference))
     options = write.model_dump_json(exclude={"indices"}), check.model_dump_json()
-    return hashed(__version__, *options, repr(capture.pose), facts)
+    return hashed(__version__, *options, repr(capture.pose), repr(capture.camera), facts)
 
 
 def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:

@@ -164,7 +164,7 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
             dtype=dataset.dtypes[i - 1],
             nodata=dataset.nodatavals[i - 1],
             has_mask=has_mask,
-            wavelength_nm=_wavelength_nm(dataset.tags(i)),
+            wavelength_nm=_wavelength_nm(dataset.tags(i) | dataset.tags(i, ns="IMAGERY")),
             saturation_value=_full_scale(dataset, i),
             georeference=georeference,
             scale_offset=(dataset.scales[i - 1], dataset.offsets[i - 1]),
@@ -355,7 +355,8 @@ def _wavelength_nm(tags: dict[str, str]) -> float | None:
     # Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100
     # nm.
     max_micrometres = 20.0
-    for name in ("wavelength", "WAVELENGTH", "CENTRAL_WAVELENGTH_NM", "central_wavelength_nm"):
+    names = "wavelength", "WAVELENGTH", "CENTRAL_WAVELENGTH_NM", "central_wavelength_nm", "CENTRAL_WAVELENGTH_UM"
+    for name in names:
         try:
             value = float(tags[name])
         except (KeyError, ValueError):

@@ -29,6 +29,7 @@ from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.gdal import open_local
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, suffix_format, with_nan
+from agalign.rasters.band_reader import RAW
 from agalign.rasters.drawing import MAX_REDUCED_PX, Grey, grey
 from agalign.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
 from agalign.rasters.output_grid import Layer, is_inside
@@ -207,10 +208,10 @@ def write_raster(
                     dataset.stats(approx=False)  # GDAL stores in the file what it computes
                 if overviews:
                     dataset.build_overviews(overviews, Resampling.average)
-        if tags is not None:
-            add_directories(partial, *tags)
         if settings.format == "cog":
             to_cog(partial, compression)
+        elif tags is not None:
+            add_directories(partial, *tags)
 
     grey_of: dict[str, Grey] = {}
     blocks, georeference = _blocks(context, layers, dtype, nodata, grey_of), capture.reference.georeference
@@ -249,10 +250,12 @@ def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, 
 
 def _descriptions(context: ProductContext, layers: Sequence[Layer]) -> list[LayerDescription]:
     result, raw = [], context.is_raw
+    is_calibrated = not raw and any(layer.band.radiometry is not None for layer in layers)
     for layer, colour in zip(layers, _colours(layers), strict=True):
         band = layer.band
         quantity = None if raw or band.radiometry is None else band.radiometry.quantity
-        tags, imagery = {} if quantity is None else {"QUANTITY": str(quantity)}, {}
+        # The bands of a photograph have no calibration: the quantity of the file is not theirs.
+        tags, imagery = {"QUANTITY": quantity or RAW} if is_calibrated else {}, {}
         if layer.is_gap:
             alignment = context.alignments.get(band.name)
             why_missing = str(context.capture.unreadable_bands.get(band.name, MISSING_BAND.cause))
@@ -340,10 +343,10 @@ def nodata_value(context: ProductContext, layers: Sequence[Layer], dtype: np.dty
     declared, grid = context.capture.reference.nodata, context.grid
     if not context.is_raw:
         return math.nan
-    if declared is not None and can_hold(dtype, declared):
+    if declared is not None and not math.isinf(declared) and can_hold(dtype, declared):
         return declared
     if dtype.kind == "f":
-        return math.nan  # input files may contain nan without declaring it
+        return math.nan  # input files may contain nan without declaring it; sidecars cannot contain infinite numbers
     may_lack_pixels = any(
         la.is_gap or la.band.nodata is not None or la.band.has_mask or la.band.missing for la in layers
     )

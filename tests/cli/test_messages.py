@@ -49,6 +49,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align x --jobs many", 2, "--jobs: give a whole number; 'agalign align --help' lists the options"),
         ("align x --jobs -1", 2, "--jobs: give 0 or more"),
         ("align x --accept-predicted much", 2, "--accept-predicted: give a number"),
+        ("align x --accept-predicted inf", 2, "--accept-predicted: give 1000000 or less"),
         ("align x --seed rigg", 2, "--seed: 'rigg' is unknown; choose from auto, rig, geo, structure"),
         ("align x --crop [red]", 2, "--crop: '[red]' is unknown; choose from flight, common, none"),
         ("align x --nope", 2, "no such option: --nope"),

@@ -70,7 +70,9 @@ def test_numbers_that_may_be_reflectance_are_not_calibrated_again(tmp_path: Path
 def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()
-    degraded, without_files = (Path(shutil.copytree(run, tmp_path / name)) for name in ("degraded", "without files"))
+    names = "degraded", "without files", "without tags"
+    degraded, without_files, without_tags = (Path(shutil.copytree(run, tmp_path / name)) for name in names)
+    change(find_sidecars(without_tags)[0], options={"write": {"layout": "both", "format": "cog"}})
     for out, status in ((degraded, "degraded"), (without_files, "ok")):
         path = find_sidecars(out)[0]
         change(path, products=[part for part in read_json(path)["products"] if part["kind"] != "band"], status=status)
@@ -79,6 +81,7 @@ def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path
         (run, "full", "odm", agalign.OutputError, "is not empty"),
         (run, "/vsimem/x", "odm", agalign.OutputError, "is one of GDAL's virtual paths"),
         (without_files, "to", "pix4d", agalign.ConfigurationError, "--layout bands or both"),
+        (without_tags, "to", "odm", agalign.ConfigurationError, "--format gtiff"),
         (degraded, "to", "pix4d", agalign.InputError, "no capture to export .*: its status is degraded"),
     ):
         with pytest.raises(error, match=message):

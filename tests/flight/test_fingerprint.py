@@ -59,11 +59,13 @@ def test_facts_of_the_products_change_their_fingerprint_alone(capture: Capture) 
         {"radiometry": None},
         {"radiometry": replace(band.radiometry, gain=2 * band.radiometry.gain)},
         {"radiometry": replace(band.radiometry, quantity="reflectance")},
+        {"implausible": "its tags lack the irradiance, which other files of the camera have"},
         {"georeference": by_pose},
         {"georeference": replace(by_pose, transform=2 * np.eye(3))},
     ]
     found = [fingerprints(capture), fingerprints(capture, Settings(write=WriteSettings(qa=True)))]
     found += [fingerprints(changed_band(capture, **facts)) for facts in changes]
+    found.append(fingerprints(replace(capture, camera=replace(capture.camera, serial="of both of its halves"))))
     assert {estimation for estimation, _ in found} == {of_estimation}
     assert len({products for _, products in found}) == len(found)
     # Each index is a file of its own.

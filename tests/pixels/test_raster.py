@@ -45,15 +45,16 @@ def test_images_of_each_type_are_reduced(tmp_path: Path, dtype: str) -> None:
 
 
 def test_metadata_of_a_file_is_read(tmp_path: Path) -> None:
-    profile = {"driver": "GTiff", "width": 8, "height": 6, "count": 2, "dtype": "uint16"}
+    profile = {"driver": "GTiff", "width": 8, "height": 6, "count": 3, "dtype": "uint16"}
     with rasterio.open(tmp_path / "a.tif", "w", **profile) as file:
         file.update_tags(2, wavelength="0.84", wavelength_units="micrometers")
+        file.update_tags(3, ns="IMAGERY", CENTRAL_WAVELENGTH_UM="0.717")
         file.set_band_description(1, "red")
     bands = probe(tmp_path / "a.tif")
-    assert [(b.size_px, b.dtype, b.band_index) for b in bands] == [((8, 6), "uint16", 1), ((8, 6), "uint16", 2)]
-    assert [b.name for b in bands] == ["red", ""]
-    assert [b.wavelength_nm for b in bands] == [None, 840.0]
-    assert [b.georeference for b in bands] == [None, None]
+    assert [(b.size_px, b.dtype, b.band_index) for b in bands] == [((8, 6), "uint16", k) for k in (1, 2, 3)]
+    assert [b.name for b in bands] == ["red", "", ""]
+    assert [b.wavelength_nm for b in bands] == [None, 840.0, 717.0]
+    assert [b.georeference for b in bands] == [None, None, None]
 
 
 def test_gdal_caches_megabytes_of_blocks_while_a_raster_is_open(tmp_path: Path) -> None:

@@ -13,13 +13,16 @@ from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.rasters.aligned_files import BandFiles, Stack, write_raster
+from agalign.rasters.band_reader import RAW, BandReader
 from agalign.rasters.geotiff import Block, LayerDescription, write_on_grid
 from agalign.rasters.output_grid import Layer, common_grid, flight_limits, output_layers
+from agalign.records.captures import AlignedBand
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
+from agalign.values.radiometry import Radiometry
 
 from ..conftest import textured_image, write_band
 from ..run_outputs import aligned, context_of
@@ -95,6 +98,26 @@ def test_files_of_bands_have_one_compression(tmp_path: Path, layout: str, number
         (written,) = product.write(context)
         with rasterio.open(written.path) as file:
             assert (file.count, file.profile["compress"]) == (number, compression)
+
+
+def test_a_band_without_calibration_beside_calibrated_ones_has_raw_numbers(tmp_path: Path) -> None:
+    """As the bands of a photograph: the quantity of the file is not theirs."""
+    capture = make_capture(tmp_path)
+    calibrated = [replace(b, radiometry=Radiometry("reflectance", 0.0, 65536.0, 2.0)) for b in capture.bands[:2]]
+    mixed = replace(capture, bands=(*calibrated, capture.bands[2]))
+    path = write(mixed, CROP, radiometry="auto")
+    with BandReader() as reader:
+        units = [reader.units(AlignedBand("", None, path, number)) for number in (1, 2, 3)]
+    assert units == [["reflectance"], ["reflectance"], [RAW]]
+    with rasterio.open(write(capture, CROP)) as dataset:
+        assert "QUANTITY" not in dataset.tags(1)
+
+
+@pytest.mark.parametrize(("declared", "written"), [(np.inf, np.nan), (-np.inf, np.nan), (-9999.0, -9999.0)])
+def test_an_infinite_nodata_value_is_written_as_nan(tmp_path: Path, declared: float, written: float) -> None:
+    capture = make_capture(tmp_path, "float32", nodata=declared)
+    with rasterio.open(write(capture, CROP)) as dataset:
+        np.testing.assert_equal(dataset.nodata, written)
 
 
 def test_red_green_and_blue_are_shown_as_such(tmp_path: Path) -> None:
