@@ -1,5 +1,6 @@
 """Spectral indices of all captures of a run: serially, in processes of this machine, or on an executor."""
 
+import itertools
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
@@ -57,7 +58,7 @@ def index_tasks(
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run, and ConfigurationError
     without indices, or if the target is that of another run, or has a table or page that no command has written, or an
-    index of another flight.
+    index of another flight, or if two captures have an index of the same name.
     """
     if not indices:
         raise ConfigurationError("no index is given; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
@@ -71,6 +72,11 @@ def index_tasks(
     sidecars = counted_sidecars(run_sidecars(out), out)
     task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, RunFacts.of(out))
     tasks = [replace(task, sidecar=path, file_states=states) for path, states in sidecars.items()]
+    taken: dict[str, str] = {}
+    for label, index in itertools.product((task.label for task in tasks), indices):
+        if (other := taken.setdefault(f"{label}_{index.name}", label)) != label:
+            remedy = f"give the formula '{index.name}' another name"
+            raise ConfigurationError(f"{label}_{index.name}.tif: would be an index of {other} and of {label}; {remedy}")
     if target != out and target.is_dir():
         _refuse_indices_of_others(tasks)
     return tasks

@@ -29,7 +29,7 @@ from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES
 from agalign.records.run_record import file_states
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import OtherSchemaError, is_sidecar, read_with_change
-from agalign.spectral_indices.rasters import index_rasters
+from agalign.spectral_indices.rasters import IndexRasters, index_rasters
 from agalign.values.capture import Capture, CaptureTime, source_file
 
 _Action = Literal["write", "remove", "keep", "refuse"]
@@ -46,6 +46,7 @@ class State(Enum):
     WITH_MARK = "file with the mark of the program, or empty", "write", "remove"
     CHANGED = "listed with another size, without mark; other JSON where a sidecar was", "write", "keep"
     OF_USER = "any other file", "refuse", "keep"
+    INDEX = "index in the sidecar, where another output would be", "refuse", "remove"
     OTHER_RESULT = "sidecar of another capture, or of a version with another schema", "refuse", "refuse"
     IMAGE = "image of the input", "refuse", "refuse"
     TAKEN = "output of another capture of the run, with a name that differs at most in case", "refuse", "refuse"
@@ -77,22 +78,28 @@ def refuse_to_overwrite(
     for capture in captures:
         sidecar, once = CapturePaths.of(capture, out).sidecar, cache(read)
         earlier, _ = earlier_result(sidecar, once)
-        listed = {} if earlier is None else _sizes(earlier.files, sidecar.parent)
-        for path, is_written in _outputs(capture, out, settings):
-            state, message = names.found(path, capture) or (
+        parts = [] if earlier is None else earlier.files
+        listed = _sizes(parts, sidecar.parent)
+        indices = _sizes((part for part in parts if part.kind == IndexRasters.kind), sidecar.parent)
+        for path, is_written, kind in _outputs(capture, out, settings):
+            found = names.found(path, capture) or (
                 _sidecar(path, capture, out, once) if path == sidecar else _file(path, listed)
             )
+            if path in indices and kind != IndexRasters.kind and found[0].written != "refuse":
+                message = f"{path}: is an index, which another output would replace"
+                found = State.INDEX, f"{message}; delete it, or choose another output folder with -o"
+            state, message = found
             if (state.written if is_written else state.not_written) == "refuse":
                 raise ConfigurationError(message)
 
 
-def _outputs(capture: Capture, out: Path, settings: WriteSettings) -> Iterator[tuple[Path, bool]]:
-    """Yield the path of every output of a capture, and whether a run with these settings writes it."""
+def _outputs(capture: Capture, out: Path, settings: WriteSettings) -> Iterator[tuple[Path, bool, str]]:
+    """Yield the path of every output of a capture, whether a run with these settings writes it, and its kind."""
     paths = CapturePaths.of(capture, out)
-    yield from ((paths.sidecar, True), (paths.file(PARALLAX_SUFFIX), True))
+    yield from ((paths.sidecar, True, ""), (paths.file(PARALLAX_SUFFIX), True, ""))
     for product in PRODUCTS:
         is_written = product.is_enabled(settings)
-        yield from ((path, is_written) for path in product.paths(capture, paths, settings))
+        yield from ((path, is_written, product.kind) for path in product.paths(capture, paths, settings))
 
 
 class _Names:

@@ -90,11 +90,20 @@ def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str 
         kind, info = get_args(kind)
     info = copy.copy(info)
     info.help, info.rich_help_panel = text or info.help, panel
+    if value_name(kind) == "PATH":
+        info.parser = _path
     if isinstance(info, OptionInfo):
         info.metavar = value_name(kind)
     else:
         info.metavar = f"{parameter.name.upper()}{'...' if get_origin(kind) is list else ''}"
     return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, info])
+
+
+def _path(text: str) -> Path:
+    """Return a path; an empty name, as of a shell variable that is not set, would be the working folder."""
+    if not text:
+        raise typer.BadParameter("is empty; give a path")
+    return Path(text)
 
 
 def value_name(kind: Any) -> str:

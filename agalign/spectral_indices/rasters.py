@@ -292,6 +292,9 @@ def write_rasters(
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and (file := _foreign_file(target)):
                     raise InputError(foreign(file, "choose another folder with -o"))
+                if earlier is None and (other := tags_of(target).get("INDEX", index.name)) != index.name:
+                    remedy = f"give the formula '{index.name}' another name"
+                    raise InputError(f"{target}: is the index '{other}' of another capture; {remedy}")
                 if not overwrite and (change := listed.problem(target)) and IndexRaster.complete(target) is not None:
                     raise InputError(f"{change}; --overwrite replaces it")
                 statistics = earlier or _write(index, chosen, target, source, reader, samples)

@@ -79,6 +79,15 @@ def of_user_in_an_edited_sidecar(case: Case) -> Case:
     return path, captures
 
 
+def index(case: Case) -> Case:
+    """Of a formula with the name of another output, such as a band."""
+    path, captures = with_mark(case)
+    sidecar = read_sidecar(path.with_name("f.json"))
+    part = sidecar.products[0].model_copy(update={"kind": "index", "file": path.name})
+    write_sidecar(path.with_name("f.json"), sidecar.model_copy(update={"products": [*sidecar.products, part]}))
+    return path, captures
+
+
 def other_result(case: Case) -> Case:
     sidecar = case[0].with_name("f.json")
     write_sidecar(sidecar, read_sidecar(sidecar).model_copy(update={"input_samples": {"green": "0"}}))
@@ -114,6 +123,7 @@ def too_long(case: Case) -> Case:
         (changed, State.CHANGED, "write", "keep"),
         (of_user, State.OF_USER, "was not written by agalign", "keep"),
         (of_user_in_an_edited_sidecar, State.OF_USER, "was not written by agalign", "keep"),
+        (index, State.INDEX, "is an index, which another output would replace", "remove"),
         (other_result, State.OTHER_RESULT, "belongs to a different capture", "belongs to a different capture"),
         (image, State.IMAGE, "is an image to be aligned", "is an image to be aligned"),
         (taken, State.TAKEN, "would be written of f and of F", "would be written of f and of F"),

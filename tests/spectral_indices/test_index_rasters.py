@@ -44,7 +44,7 @@ from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
-from ..conftest import raising, write_band
+from ..conftest import raising, write_band, write_signed
 from ..program import agalign_here
 from ..run_outputs import aligned, context_of, indices_of, table_in
 
@@ -323,6 +323,23 @@ def test_indices_of_another_flight_are_not_replaced(tmp_path: Path, ids: tuple[s
         indices_of(tmp_path / "two", target=target)
     assert report.path.read_bytes() == before
     assert indices_of(tmp_path / "one", target=target)[0].kept
+
+
+def test_a_formula_does_not_replace_the_index_of_another_capture(tmp_path: Path) -> None:
+    """Captures `plot` and `plot_b`: NDVI of one has the name of a formula `b_ndvi` of the other."""
+    formula = index_of_formula("b_ndvi=(N-G)/(N+G)")
+    make_aligned(tmp_path, 2)
+    second = tmp_path / "0000SET" / "IMG_0002.json"
+    write_signed(second.with_name("IMG_0001_b.json"), second.read_text().replace("IMG_0002", "IMG_0001_b"))
+    second.with_suffix(".tif").rename(second.with_name("IMG_0001_b.tif"))
+    second.unlink()
+    with pytest.raises(ConfigurationError, match=r"IMG_0001_b_ndvi\.tif: would be an index of .*IMG_0001 and of"):
+        indices_of(tmp_path, "ndvi", formula)
+    (ndvi,) = (report for report in indices_of(tmp_path, "ndvi") if report.path.name == "IMG_0001_b_ndvi.tif")
+    before = ndvi.path.read_bytes()
+    problem = next(report.problem for report in indices_of(tmp_path, formula) if report.problem)
+    assert "is the index 'ndvi' of another capture; give the formula 'b_ndvi' another name" in problem
+    assert ndvi.path.read_bytes() == before
 
 
 def test_every_capture_that_failed_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
