@@ -16,7 +16,7 @@ from agalign.cameras.image_file import ImageFile, OwnFile, Problem, problem_of, 
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
-from agalign.errors import ConfigurationError, InputError, NoSuchBandError
+from agalign.errors import ConfigurationError, GeometryError, InputError, NoSuchBandError
 from agalign.host.text import counted
 from agalign.pixels.coordinates import transformed
 from agalign.pixels.raster import probe, suffix_format
@@ -223,16 +223,18 @@ def mosaics_onto(
 
 
 def mosaics_apart_km(fixed: Band, moving: Band) -> float:
-    """Return the distance between the centres of two georeferenced rasters on the ground; 0 if they may overlap.
-
-    Raises GeometryError if their coordinates cannot be transformed.
+    """Return the distance between the centres of two georeferenced rasters on the ground; 0 if they may overlap, as in
+    a local CRS, whose place on Earth is unknown.
     """
     centres, half_diagonals_km = [], 0.0
     for band in (fixed, moving):
         assert band.georeference is not None
         width, height = band.size_px
         on_map = geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]]))
-        on_earth = transformed(on_map, band.georeference.crs_wkt, "EPSG:4326").tolist()
+        try:
+            on_earth = transformed(on_map, band.georeference.crs_wkt, "EPSG:4326").tolist()
+        except GeometryError:
+            return 0.0
         centre, corner = (Position(latitude, longitude) for longitude, latitude in on_earth)
         centres.append(centre)
         half_diagonals_km += distance_km(centre, corner)

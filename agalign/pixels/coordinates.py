@@ -11,6 +11,7 @@ from rasterio import warp
 from rasterio.errors import CRSError
 
 from agalign.errors import ConfigurationError, GeometryError
+from agalign.host.text import shortened
 
 _PROJ_VARIABLES = "PROJ_DATA", "PROJ_LIB"
 """Folders of PROJ's data. rasterio uses them instead of its own, whenever one of its environments starts, even if they
@@ -66,5 +67,6 @@ def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDAr
         source, target = (rasterio.CRS.from_user_input(system) for system in (from_crs, to_crs))
         x, y = warp.transform(source, target, points[:, 0], points[:, 1])
     except Exception as error:  # GDAL's errors have no public class
-        raise GeometryError(f"coordinates cannot be transformed ({error})") from None
+        cause = shortened(" ".join(f"{error}".split()))  # PROJ's has a description of both systems
+        raise GeometryError(f"coordinates cannot be transformed ({cause})") from None
     return np.stack([x, y], axis=-1)

@@ -140,6 +140,16 @@ def test_a_distant_mosaic_is_reported(mosaics: Path, tmp_path: Path) -> None:
     assert re.search(r"away\.tif: is 11[01]\.\d km away from the reference", done.stderr)
 
 
+def test_mosaics_in_a_local_reference_system_are_aligned(mosaics: Path, tmp_path: Path) -> None:
+    """As Metashape writes them without positions: nobody knows where on Earth they are."""
+    local = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1],AXIS["X",EAST]'
+    for name in ("spring", "summer"):
+        with rasterio.open(mosaics / f"{name}.tif") as source:
+            in_metres = {**source.profile, "crs": rasterio.CRS.from_wkt(f'{local},AXIS["Y",NORTH]]')}
+            write_band(tmp_path / f"{name}.tif", source.read(), **in_metres)
+    assert onto(tmp_path, tmp_path / "summer.tif", tmp_path / "out").returncode == 0
+
+
 @pytest.mark.full
 def test_the_limit_is_a_pixel_of_the_reference_and_the_advice_fits_mosaics(tmp_path: Path) -> None:
     """Leaves and branches that move: 3 px of the files, less than a pixel of mosaics with the size that is needed."""
