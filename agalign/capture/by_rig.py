@@ -12,11 +12,12 @@ from agalign.capture.candidate import Candidate
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import CheckSettings
-from agalign.flight.rig import Observation, Rig, distance_px, expected_square
+from agalign.flight.rig import Observation, Rig, distance_px, expected_square, lattice
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import Alignments, JointResult, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
+from agalign.values.lens_shapes import variance_px2
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax
@@ -116,7 +117,9 @@ def observation(
         if pair.has_rig_pixels and pair.name in joints:
             joint = joints[pair.name]
             mappings[pair.name] = pair.scales.between_files(joint.fixed_to_moving)
-            std_px[pair.name] = pair.in_reference_file_px(joint.corner_std_px)
+            size_px = pair.fixed.size_px
+            variances_px2 = variance_px2(lattice(size_px)[0], joint.covariance_px2, size_px)
+            std_px[pair.name] = pair.in_reference_file_px(math.sqrt(variances_px2.mean()))
     if capture is None:
         return Observation(None, mappings, std_px)
     return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion)

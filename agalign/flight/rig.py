@@ -54,7 +54,7 @@ class Observation:
     mappings: Mapping[str, Matrix]
     """fixed_to_moving by band, undistorted px of the files."""
     std_px: Mapping[str, float]
-    """Standard error of each mapping, px of the reference's file."""
+    """Standard error of each mapping, RMS over the image, px of the reference's file."""
     altitude_m: float | None = None
     """Altitude in the tags, above any datum; None if unknown."""
     motion: tuple[float, float] | None = None
@@ -149,15 +149,22 @@ def capture_factors(design: Array, differences: Array, weights: Array) -> Estima
     (k, 2, 3, 5) their derivative with respect to the factors. `weights` (n, k) are from `mapping_weight`, 0 without a
     mapping.
     """
-    half_weight_px = 0.3  # residual of a mapping at which its robust weight is one half
+    # Residual of an accurate mapping at which its robust weight is one half; others are scaled by their errors.
+    half_weight_px = 0.3
+    scale = (1 + 1 / np.maximum(weights * half_weight_px**2, 1e-12)) ** -0.5
     by_mapping = design.reshape(len(design), 6, FACTORS), differences.reshape(*weights.shape, 6)
+    scaled = scale[..., None, None] * by_mapping[0], scale[..., None] * by_mapping[1]
     information = np.diag(1 / np.square(FACTOR_STD_PX))
-    return least_squares(*by_mapping, weights, information, robust=Robust(half_weight_px))
+    return least_squares(*scaled, weights / scale**2, information, robust=Robust(half_weight_px))
 
 
 def mapping_weight(std_px: ArrayLike, model_error_px: ArrayLike = 0.0) -> Array:
-    """Return the weights (n,), 1 / px^2, of mappings from their standard errors (n,) and the error of the model."""
-    return np.asarray(1 / (np.square(std_px) + np.square(model_error_px) + MIN_STD_PX**2))
+    """Return the weights (n,), 1 / px^2, of mappings from their standard errors (n,) and the error of the model, px.
+
+    These are RMS lengths over the image; the largest variance of a coefficient is half of their square, if the whole
+    error is a translation.
+    """
+    return np.asarray(2 / (np.square(std_px) + np.square(model_error_px) + MIN_STD_PX**2))
 
 
 def expected_square(mean_square: ArrayLike, count: ArrayLike) -> Array:

@@ -126,12 +126,14 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Predic
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
     both = np.stack([differences, 0 * differences])  # of this capture, and of one with accurate mappings of all others
     solutions, (covariance, if_all_known), _ = capture_factors(designs, both, weights)
-    excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2
+    residuals_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2))
+    is_known = weights[0] > 0
+    excess_px2 = (residuals_px2 - expected_px**2)[is_known] - np.square(std_px)[is_known]
     learned_px2 = [np.square(c.factors[:3]).sum() for c in rig.captures]
     outside_px2 = np.square(solutions[0, :3]).sum() - np.mean(learned_px2 or [0.0])
     of_factors_px2 = np.einsum("akf,fg,akg->", design, covariance - if_all_known, design)
     baseline_px2 = 2 * rig.baseline_std[band] ** 2 * outside_px2
-    variances_px2 = (np.median(excess_px2[weights[0] > 0]), of_factors_px2, baseline_px2)
+    variances_px2 = (np.median(excess_px2), of_factors_px2, baseline_px2)
     error_px = np.sqrt(rig.from_bands_px[band] ** 2 + sum(max(0.0, v) for v in variances_px2))
     mapping = rig.mapping(band, solutions[0])
     return mapping, "bands" if rig.factors else "flight", float(error_px)

@@ -170,6 +170,23 @@ def test_a_capture_after_the_learned_ones_may_have_drifted_further() -> None:
         assert error < 1.5 * std
 
 
+@pytest.mark.parametrize("std_px", [0.2, 1.0])
+def test_the_error_of_a_prediction_by_uncertain_bands_is_that_of_many(std_px: float) -> None:
+    """Neither twice as much, by noise that counts twice, nor with the outliers of accurate bands."""
+    rng = np.random.default_rng(0)
+    rig = learn_rig([observation(float(k), 3 * rng.normal(), noise=0.03, seed=k) for k in range(20)], SIZE, BASELINES)
+    pairs = []
+    for k in range(100, 200):
+        distance = 3 * rng.normal()
+        # The noise is along an axis, the standard error of both.
+        known = observation(float(k), distance, without="NIR", noise=std_px / math.sqrt(2), seed=k)
+        known = replace(known, std_px=dict.fromkeys(known.mappings, std_px))
+        pairs.append(error_px(rig, "NIR", known, mappings(distance)["NIR"]))
+    true_px, claimed_px = np.sqrt(np.square(pairs).mean(axis=0))
+    assert 0.9 < claimed_px / true_px < 1.5
+    assert np.mean([error <= std for error, std in pairs]) < 0.8
+
+
 def test_an_altitude_between_learned_ones_does_not_count_as_unseen() -> None:
     """The distance is interpolated over the altitude, in captures that are not in its order."""
     altitudes_m = np.random.default_rng(0).permutation(np.arange(50.0, 71.0))

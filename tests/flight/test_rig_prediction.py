@@ -188,8 +188,8 @@ LENSES = np.array([[0.6, 0.0, 0.2], [0.0, 0.7, -0.5], [-0.3, 0.2, 0.8]])
 DISTANCE = np.tensordot(LENSES, design_tensor(("distance",)), 1)
 
 
-def test_a_weight_is_the_inverse_of_all_variances() -> None:
-    assert mapping_weight(0.3, 0.4) == pytest.approx(1 / (0.3**2 + 0.4**2 + 0.05**2))
+def test_a_weight_is_the_inverse_of_all_variances_along_an_axis() -> None:
+    assert mapping_weight(0.3, 0.4) == pytest.approx(2 / (0.3**2 + 0.4**2 + 0.05**2))
 
 
 def test_the_median_mapping_ignores_an_outlier() -> None:
