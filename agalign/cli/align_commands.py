@@ -48,7 +48,7 @@ def _align(
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.spectral_indices.formulas import chosen_indices
 
-    source = folder.resolve()
+    source = folder.resolve() if folder.name == ".." else folder.absolute()  # a link keeps its name
     target = out or source.parent / f"{source.name}-aligned"
     settings = Settings.model_validate(given["settings"])
     dask = given["run"].pop("executor")

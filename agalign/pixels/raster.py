@@ -29,6 +29,7 @@ from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
+from agalign.values.spectrum import role_of
 
 _MAXIMA = {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}
 """Of the types that sensors deliver."""
@@ -151,7 +152,7 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
     is_colour = sorted(colours) == ["Blue", "Green", "Red"]
     if is_colour and suffix_format(path) == "TIFF" and _is_grey(dataset, indices):
         indices, is_colour = indices[:1], False
-    has_mask = alpha is not None or MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+    has_mask = alpha is not None or _has_mask(dataset, 1)
     georeference, overviews = _georeference(dataset), tuple(dataset.overviews(1))
     return tuple(
         Band(
@@ -327,17 +328,29 @@ def with_nan(pixels: NDArray[np.generic], nodata: float | None) -> NDArray[np.fl
 
 def _dataset_mask(dataset: rasterio.DatasetReader, index: int, **reading: Any) -> Mask | np.bool_:
     """Return the mask of a file, read with these options of `read_masks`; True for a file without a mask."""
-    if MaskFlags.per_dataset in dataset.mask_flag_enums[index - 1]:
+    if _has_mask(dataset, index):
         return np.asarray(dataset.read_masks(index, **reading) > 0)
     # GDAL reports the alpha band as a mask only for files of 2 or 4 bands.
     alpha = _alpha_index(dataset)
     return np.True_ if alpha is None else np.asarray(dataset.read(alpha, **reading) > 0)
 
 
+def _has_mask(dataset: rasterio.DatasetReader, index: int) -> bool:
+    """Return True for a mask of the file, which is not an alpha band."""
+    flags = dataset.mask_flag_enums[index - 1]
+    return MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags
+
+
 def _alpha_index(dataset: rasterio.DatasetReader) -> int | None:
-    """Return the index of the alpha band of a file of several bands, from 1; None without one."""
+    """Return the index of the alpha band of a file of several bands, from 1; None without one.
+
+    Programs mark the fourth band of an image as alpha also if its name is that of a spectral band.
+    """
     colours = dataset.colorinterp
-    return colours.index(ColorInterp.alpha) + 1 if len(colours) > 1 and ColorInterp.alpha in colours else None
+    if len(colours) < 2 or ColorInterp.alpha not in colours:
+        return None
+    index = colours.index(ColorInterp.alpha)
+    return index + 1 if role_of(dataset.descriptions[index] or "", None) is None else None
 
 
 def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:

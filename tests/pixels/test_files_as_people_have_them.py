@@ -183,6 +183,21 @@ def test_an_alpha_band_is_the_mask_of_any_number_of_bands(tmp_path: Path, bands:
         assert not read_for_alignment(band, 160).valid[:, :48].any()
 
 
+def test_a_near_infrared_band_that_is_marked_as_alpha_is_a_band(tmp_path: Path) -> None:
+    """As programs export four bands: the fourth of an RGB image."""
+    planes = np.stack([texture_numbers(seed=k) for k in range(4)])
+    planes[3, :, :100] = 0
+    write_band(tmp_path / "a.tif", planes)
+    with rasterio.open(tmp_path / "a.tif", "r+") as file:
+        file.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
+        file.descriptions = "Red", "Green", "Blue", "NIR"
+    (*_, nir) = stored = probe(tmp_path / "a.tif")
+    assert [(b.name, b.has_mask) for b in stored] == [(name, False) for name in ("Red", "Green", "Blue", "NIR")]
+    pixels, valid = read_tile(nir, Tile(0, 0, 320, 240))
+    np.testing.assert_array_equal(pixels, planes[3])
+    assert valid.all()
+
+
 @pytest.mark.parametrize(("name", "dtype"), [("f.tif", "uint8"), ("f_RGB.tif", "uint8"), ("f_RGB.tif", "uint16")])
 def test_colour_images_of_one_lens_are_companions_of_the_bands(tmp_path: Path, name: str, dtype: str) -> None:
     write_capture(tmp_path, "green", "red", "nir")
