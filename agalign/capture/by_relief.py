@@ -504,10 +504,17 @@ def _std_px(reliefs: Sequence[Relief], max_std_px: float) -> FloatImage:
     It is the delete-a-group jackknife, sqrt((n - 1) / n sum |z_i - mean|^2), as the median over the surroundings:
     reliefs from different bands differ at depth edges and in areas without texture, by values that single pixels do not
     have in common. It approaches `max_std_px`, as the harmonic sum of both variances.
+
+    The median of such an error, whose square has a chi-squared distribution with n - 1 degrees of freedom, is smaller
+    than its RMS, the more so the fewer reliefs there are. It has the scale of four, by which 0.71 of the windows of a
+    bench with plants and a boom, and 0.77 of those of bananas, are within the expected error, and 0.95 within twice it.
     """
     surroundings_px = 17  # about the distance of the nodes of an error map (NODES_PX), and odd
     values = np.stack([relief.parallax_px for relief in reliefs])
-    std_px = np.sqrt((len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0))
+    freedom, of_four = len(values) - 1, 3
+    median_of_mean = [(1 - 2 / (9 * k)) ** 3 for k in (of_four, freedom)]  # Wilson and Hilferty (1931)
+    variance_px2 = median_of_mean[0] / median_of_mean[1] * np.square(values - values.mean(axis=0)).mean(axis=0)
+    std_px = np.sqrt(freedom * variance_px2)
     # The median of bytes is fast; a byte is a step of 3.5 %, and the median does not depend on the scale.
     least_px, steps_per_octave = RELIEF_STEP, 20
     octaves = np.log2(np.maximum(std_px, least_px) / least_px)

@@ -111,7 +111,7 @@ class Parallax:
         """
         min_width_px = 1.5  # smaller differences of parallax are slopes of one surface, or noise
         min_area_px = 16  # smaller areas are single pixels with wrong parallax
-        z_px, (t_x, t_y) = self.relief.parallax_px, np.multiply(self.baseline, self.relief.scale)
+        z_px, (t_x, t_y) = self.relief.parallax_px, np.multiply(self.baseline, self.relief.scale) * self.relief.unit
         min_step_px = min_width_px / max(math.hypot(t_x, t_y), 1e-9)
         parallax_px = z_px - z_px.min()
         height, width = parallax_px.shape

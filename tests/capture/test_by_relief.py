@@ -224,12 +224,20 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
 
 def test_reliefs_from_different_bands_give_a_standard_error(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
     one, other = (Relief(np.full((40, 60), z, np.float32), np.ones((40, 60), np.float32)) for z in (1.0, 3.0))
-    np.testing.assert_allclose(_std_px([one, other], np.inf), 1.0, rtol=0.036)
-    np.testing.assert_allclose(_std_px([one, one, one, other], np.inf), np.sqrt(3 * 0.75), rtol=0.036)
+    of_four = np.sqrt(3 * 0.75)
+    np.testing.assert_allclose(_std_px([one, one, one, other], np.inf), of_four, rtol=0.036)
     # Where the bands disagree by more than the windows, it approaches the error of these.
-    np.testing.assert_allclose(_std_px([one, other], 2.0), 1 / np.sqrt(1 + 1 / 4), rtol=0.036)
+    np.testing.assert_allclose(_std_px([one, one, one, other], 2.0), of_four / np.hypot(1, of_four / 2), rtol=0.036)
     far = replace(other, parallax_px=100 * other.parallax_px)
     np.testing.assert_allclose(_std_px([one, far], 2.0), 2.0, rtol=0.001)
+    # The medians of errors that are equal and normally distributed are equal, whatever the number of reliefs.
+    rng, claimed = np.random.default_rng(0), []
+    for count in (2, 3, 4):
+        noise = rng.normal(0, 0.3 * np.sqrt(count), (count, 200, 300)).astype(np.float32)
+        without_one = [Relief((noise.sum(axis=0) - n) / (count - 1), np.ones_like(n)) for n in noise]
+        claimed.append(float(np.median(_std_px(without_one, np.inf))))
+    assert max(claimed) < 1.05 * min(claimed)
+    assert min(claimed) > 0.8 * 0.3
     speck = one.parallax_px.copy()  # single pixels do not count
     speck[10:14, 20:24] += 50
     assert _std_px([one, replace(one, parallax_px=speck)], np.inf).max() < 0.02

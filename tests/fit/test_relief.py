@@ -35,6 +35,14 @@ def test_low_relief_and_a_band_without_a_baseline_have_no_occlusions() -> None:
         assert not occluded(layers(near_px=0.9), baseline).any()
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_occlusions_of_a_relief_of_another_image_size_are_the_same(factor: float) -> None:
+    parallax = Parallax(layers(), (1.0, 0.3))
+    known, again = parallax.with_occlusions(), parallax.rescaled(PixelScale(factor, factor)).with_occlusions()
+    assert known.hidden.any()
+    np.testing.assert_array_equal(again.hidden, known.hidden)
+
+
 def by_definition(relief: Relief, baseline: tuple[float, float], min_step_px: float) -> Mask:
     """The z-buffer, pixel by pixel, before the closing and the removal of small areas."""
     z = relief.parallax_px.astype(float)
