@@ -4,6 +4,7 @@ All are deterministic. Gradients and local moments are computed at full resoluti
 pixels; in large images over those on a regular grid of at least 250 000 pixels.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -60,7 +61,7 @@ class FixedSimilarity:
             mattes_mi=-mutual_information(joint),
             nmi=normalised_mutual_information(joint),
             ncc=correlation(fixed_values, moving_values),
-            gradient_correlation=correlation(*gradients) if len(inside) else 0.0,
+            gradient_correlation=correlation(*gradients) if len(inside) else math.nan,
             structure_ssim=_ssim(self.gradient, gradient, valid, complete_windows),
             overlap=overlap,
         )
@@ -172,10 +173,11 @@ class _Gradient:
 def _ssim(fixed: _Gradient, moving: _Gradient, valid: NDArray[np.intp], complete: NDArray[np.intp]) -> float:
     """Return the mean SSIM of the gradient magnitudes over the samples with `complete` windows.
 
-    The magnitudes are standardised over the `valid` samples; the local moments are transformed accordingly.
+    NaN without any. The magnitudes are standardised over the `valid` samples; the local moments are transformed
+    accordingly.
     """
     if not len(complete):
-        return 0.0
+        return math.nan
     (mean_a, scale_a), (mean_b, scale_b) = (_standardisation(g.sampled[valid]) for g in (fixed, moving))
     if not scale_a * scale_b:  # one image is constant
         return 0.0

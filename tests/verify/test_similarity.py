@@ -74,6 +74,10 @@ def test_similarity_uses_only_valid_pixels() -> None:
     nothing = vars(similarity(fixed, moving, np.zeros(fixed.shape, bool)))
     assert nothing.pop("overlap") == 0.0
     assert np.isnan(list(nothing.values())).all()
+    stripes = np.broadcast_to(np.arange(fixed.shape[1]) % 3 > 0, fixed.shape)  # no gradient has all of its pixels
+    of_stripes = similarity(fixed, moving, stripes)
+    assert np.isfinite([of_stripes.mattes_mi, of_stripes.nmi, of_stripes.ncc]).all()
+    assert np.isnan([of_stripes.gradient_correlation, of_stripes.structure_ssim]).all()
 
 
 @pytest.mark.filterwarnings("error")
