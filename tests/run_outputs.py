@@ -12,11 +12,13 @@ from synthetic_flights.troubles import make_two_headings
 
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.config import Settings, WriteSettings
+from agalign.rasters.band_reader import BandReader
 from agalign.rasters.output_grid import Layer
 from agalign.rasters.product import CapturePaths, ProductContext
+from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.formulas import INDICES, Index
-from agalign.spectral_indices.rasters import IndexReport
+from agalign.spectral_indices.rasters import IndexReport, write_index
 from agalign.synthetic.cameras import REDEDGE
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed
@@ -80,6 +82,12 @@ def table_in(path: Path) -> list[dict[str, str]]:
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def index_of(bands: Sequence[AlignedBand], index: Index, base: Path, **more: Any) -> IndexReport:
+    """Write an index of bands as `base`_<index>.tif."""
+    with BandReader() as reader:
+        return write_index(reader, bands, index, base, base.name, **more)
 
 
 def indices_of(

@@ -6,6 +6,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -15,6 +16,7 @@ from agalign.errors import AgalignError, ConfigurationError, SidecarError
 from agalign.host.files import REPORT_FILE, RUN_FILE, below_as_given, written_below
 from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.processes import cores_for
+from agalign.rasters.band_reader import BandReader
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
@@ -22,7 +24,7 @@ from agalign.records.run_record import counted_sidecars
 from agalign.records.sidecar_file import add_products, label_of, read_checked, read_sidecar, run_sidecars
 from agalign.spectral_indices.formulas import Index
 from agalign.spectral_indices.indices_csv import refuse_foreign_table, to_check, update_table
-from agalign.spectral_indices.rasters import IndexRasters, IndexReport, index_rasters, write_rasters
+from agalign.spectral_indices.rasters import IndexRasters, IndexReport, index_rasters, write_index
 
 
 @dataclass(frozen=True)
@@ -138,11 +140,9 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
             files = ListedFiles.of(sidecar, task.sidecar.parent, task.file_states)
-            samples = sidecar.own_samples
-            written = write_rasters(
-                bands, task.indices, base, task.label, overwrite=task.overwrite, listed=files, samples=samples
-            )
-            reports = [*written]
+            more: dict[str, Any] = {"overwrite": task.overwrite, "samples": sidecar.own_samples}
+            with BandReader(files) as reader:
+                reports = [write_index(reader, bands, index, base, task.label, **more) for index in task.indices]
             if task.target == task.out:
                 listed = {part.file for part in sidecar.products}
                 # A command that was killed may have written a raster that the sidecar does not list.

@@ -36,7 +36,7 @@ class BandReader(ExitStack):
 
     def __init__(self, listed: ListedFiles | None = None) -> None:
         super().__init__()
-        self._listed = listed or ListedFiles()
+        self.listed = listed or ListedFiles()
         self._files: dict[Path, OpenRaster] = {}
 
     def file(self, path: Path, index: int) -> OpenRaster:
@@ -45,7 +45,7 @@ class BandReader(ExitStack):
         Raises InputError if it is not as it was written, cannot be read, or has no band `index`, counted from 1.
         """
         if path not in self._files:
-            self._listed.check(path)
+            self.listed.check(path)
             try:
                 self._files[path] = self.enter_context(open_raster(path))
             except UnreadableFileError as error:  # whose remedy is that of an image of the camera

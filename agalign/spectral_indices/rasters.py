@@ -185,25 +185,21 @@ class IndexRasters(Product):
         bands, problems = list(_bands(context)), []
         masked = list(_masked(bands, context))
         stay_masked = {raster.name for raster in rasters if raster.is_masked and any(b.quality for b in masked)}
-        for index in requested:
-            (report,) = write_rasters(
-                masked if index.name in stay_masked else bands, [index], base, label, samples=samples
-            )
-            if report.path is not None:
-                yield from self._files(context, index, report)
-            elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
-                problems.append(f"{index.name}: {report.problem}")
-        for raster in earlier:
-            if raster.index is None:
-                yield LostFile(raster.path, "its formula is unknown")
-                continue
-            (report,) = write_rasters(
-                masked if raster.is_masked else bands, [raster.index], base, label, samples=samples
-            )
-            if report.problem:
-                yield LostFile(raster.path, report.problem)
-            else:
-                yield from self._files(context, raster.index, report)
+        wanted = [(index, None) for index in requested] + [(raster.index, raster) for raster in earlier]
+        with BandReader() as reader:
+            for index, raster in wanted:
+                if index is None:
+                    assert raster is not None
+                    yield LostFile(raster.path, "its formula is unknown")
+                    continue
+                is_masked = index.name in stay_masked if raster is None else raster.is_masked
+                report = write_index(reader, masked if is_masked else bands, index, base, label, samples=samples)
+                if report.path is not None:
+                    yield from self._files(context, index, report)
+                elif raster is not None:
+                    yield LostFile(raster.path, report.problem)
+                elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
+                    problems.append(f"{index.name}: {report.problem}")
         if problems:
             raise InputError("; ".join(problems))
 
@@ -262,47 +258,49 @@ def _masked(bands: Sequence[AlignedBand], context: ProductContext) -> Iterator[A
             yield replace(band, quality=(raster.path, layers[band.name], raster.sha256))
 
 
-def write_rasters(
+def write_index(
+    reader: BandReader,
     bands: Sequence[AlignedBand],
-    indices: Sequence[Index],
+    index: Index,
     base: Path,
     label: str,
     *,
     overwrite: bool = True,
-    listed: ListedFiles | None = None,
     samples: Collection[str] = (),
-) -> Iterator[IndexReport]:
+) -> IndexReport:
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically; `samples` are `Sidecar.own_samples` of
     the capture, for `IndexRaster.is_of_other`.
 
-    Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
-    band of an index is missing, not usable, not in the unit that the index needs, not as the sidecar has `listed` its
+    Without `overwrite`, a raster that an earlier command wrote from the same bands with the same formula is kept. If a
+    band of the index is missing, not usable, not in the unit that the index needs, not as the sidecar has listed its
     file, or if a file cannot be read or written, the report has the problem.
     """
-    listed = listed or ListedFiles()
-    with BandReader(listed) as reader:
-        for index in indices:
-            target = base.with_name(f"{base.name}_{index.name}.tif")
-            try:
-                chosen = _bands_of_index(bands, index)
-                source = _fingerprint(index, chosen)
-                may_be_kept = not overwrite and all(band.sha256 for band in chosen)
-                earlier = _finished_before(target, source, listed) if may_be_kept else None
-                if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
-                    raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-                if earlier is None and (file := _foreign_file(target)):
-                    raise InputError(foreign(file, "choose another folder with -o"))
-                if earlier is None and (other := tags_of(target).get("INDEX", index.name)) != index.name:
-                    remedy = f"give the formula '{index.name}' another name"
-                    raise InputError(f"{target}: is the index '{other}' of another capture; {remedy}")
-                if not overwrite and (change := listed.problem(target)) and IndexRaster.complete(target) is not None:
-                    raise InputError(f"{change}; --overwrite replaces it")
-                statistics = earlier or _write(index, chosen, target, source, reader, samples)
-            except (InputError, OutputError) as error:
-                yield IndexReport(label, index.name, problem=str(error))
-                continue
-            is_masked = any(band.quality is not None for band in chosen)
-            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
+    target = base.with_name(f"{base.name}_{index.name}.tif")
+    try:
+        chosen = _bands_of_index(bands, index)
+        source = _fingerprint(index, chosen)
+        may_be_kept = not overwrite and all(band.sha256 for band in chosen)
+        earlier = _finished_before(target, source, reader.listed) if may_be_kept else None
+        if earlier is None:
+            _refuse(target, index, bands)
+        if not overwrite and (change := reader.listed.problem(target)) and IndexRaster.complete(target) is not None:
+            raise InputError(f"{change}; --overwrite replaces it")
+        statistics = earlier or _write(index, chosen, target, source, reader, samples)
+    except (InputError, OutputError) as error:
+        return IndexReport(label, index.name, problem=str(error))
+    is_masked = any(band.quality is not None for band in chosen)
+    return IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
+
+
+def _refuse(target: Path, index: Index, bands: Sequence[AlignedBand]) -> None:
+    """Raise InputError for a file that an index may not replace."""
+    remedy = f"give the formula '{index.name}' another name"
+    if target.resolve() in {band.file.resolve() for band in bands}:
+        raise InputError(f"{target}: is the file of a band; {remedy}")
+    if file := _foreign_file(target):
+        raise InputError(foreign(file, "choose another folder with -o"))
+    if (other := tags_of(target).get("INDEX", index.name)) != index.name:
+        raise InputError(f"{target}: is the index '{other}' of another capture; {remedy}")
 
 
 def _foreign_file(raster: Path) -> Path | None:

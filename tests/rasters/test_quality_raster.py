@@ -16,7 +16,6 @@ from agalign.rasters.output_grid import Layer
 from agalign.records.captures import bands_of
 from agalign.records.sidecar_file import read_checked
 from agalign.spectral_indices.formulas import index_named, index_of_formula
-from agalign.spectral_indices.rasters import write_rasters
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.choices import UNUSABLE_QUALITY, Interpolation, Quality
@@ -29,7 +28,7 @@ from agalign.values.pixel_units import PixelScale
 
 from ..builders import residual_of
 from ..conftest import Shared, seeded, write_band
-from ..run_outputs import aligned
+from ..run_outputs import aligned, index_of
 
 GRID = OutputGrid(4, 2, 60, 40)
 
@@ -211,9 +210,9 @@ def test_indices_omit_pixels_flagged_in_their_own_bands(sidecar: Path, tmp_path:
         flags[saturated], flags[predicted] = Quality.SATURATED, Quality.PREDICTED
         for index, name in enumerate(raster.descriptions, start=1):
             raster.write(flags if name == "NIR" else np.zeros_like(flags), index)
-    (ndvi,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "plain", "a")
-    (left,) = write_rasters(masked, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
-    (green,) = write_rasters(masked, [index_of_formula("green=(G-R)/(G+R)")], tmp_path / "masked", "a")
+    ndvi = index_of(plain, index_named("ndvi"), tmp_path / "plain")
+    left = index_of(masked, index_named("ndvi"), tmp_path / "masked", overwrite=False)
+    green = index_of(masked, index_of_formula("green=(G-R)/(G+R)"), tmp_path / "masked")
     values, kept, without_nir = (rasterio.open(r.path).read(1) for r in (ndvi, left, green))
     assert np.isfinite(values[saturated]).all()
     values[saturated] = np.nan
@@ -222,7 +221,7 @@ def test_indices_omit_pixels_flagged_in_their_own_bands(sidecar: Path, tmp_path:
     assert ndvi.statistics.masked_share == 0
     assert np.isfinite(without_nir[saturated]).all()
     # The same bands without the mask are another raster, which is not taken for this one.
-    (again,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
+    again = index_of(plain, index_named("ndvi"), tmp_path / "masked", overwrite=False)
     assert not again.kept
     with pytest.raises(agalign.InputError, match="--qa"):
         bands_of(result.model_copy(update={"products": []}), sidecar.parent, mask_qa=True)

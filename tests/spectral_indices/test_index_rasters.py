@@ -38,7 +38,7 @@ from agalign.spectral_indices.formulas import (
     index_of_formula,
 )
 from agalign.spectral_indices.indices_csv import read_table, update_table
-from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, write_rasters
+from agalign.spectral_indices.rasters import IndexReport, IndexStatistics
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
@@ -46,7 +46,7 @@ from agalign.values.mapping import PixelMapping
 
 from ..conftest import raising, write_band, write_signed
 from ..program import agalign_here
-from ..run_outputs import aligned, context_of, indices_of, table_in
+from ..run_outputs import aligned, context_of, index_of, indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
 sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
@@ -185,7 +185,7 @@ def test_pixels_that_the_percentiles_skip_are_valid(tmp_path: Path) -> None:
     plane[1::2, 1::2] = 0.2
     write_band(tmp_path / "a.tif", np.stack([plane, 2 * plane]))
     bands = [AlignedBand(name, None, tmp_path / "a.tif", number) for number, name in enumerate(("red", "nir"), start=1)]
-    (report,) = write_rasters(bands, [INDICES["ndvi"]], tmp_path / "a", "a")
+    report = index_of(bands, INDICES["ndvi"], tmp_path / "a")
     assert np.isnan(report.median)
     assert report.statistics.valid_share == pytest.approx(0.25, abs=1e-3)
 
@@ -346,7 +346,7 @@ def test_every_capture_that_failed_has_a_row(tmp_path: Path, monkeypatch: pytest
     make_aligned(tmp_path, 2)
     write_pages(tmp_path, pytest.fail)
     os.truncate(tmp_path / "0000SET" / "IMG_0001.json", 900)
-    monkeypatch.setattr(index_run, "write_rasters", raising(MemoryError()))
+    monkeypatch.setattr(index_run, "write_index", raising(MemoryError()))
     indices_of(tmp_path)
     damaged, without_memory = table_in(tmp_path / "indices.csv")
     assert "IMG_0001.json" in damaged["problem"]
@@ -362,7 +362,7 @@ def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
         path = tmp_path / f"a_{band}.tif"
         write_band(path, np.full(size_px[::-1], 0.1, np.float32))
         bands.append(AlignedBand(band, None, path, 1))
-    (report,) = write_rasters(bands, [index_of_formula(f"{name}=(G-R)/(G+R)")], tmp_path / "a", "a")
+    report = index_of(bands, index_of_formula(f"{name}=(G-R)/(G+R)"), tmp_path / "a")
     assert report.path is None
     assert problem in report.problem
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a_green.tif", "a_red.tif"]
