@@ -8,7 +8,7 @@ with the same reference image that does not follow it is `predicted`; bands of m
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -305,9 +305,7 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Un
         for band, verifying in zip(estimate.bands, cycle(estimate.verifying_reliefs), strict=False)
     ]
     estimate = estimate.with_std_px(held_out)
-    result: dict[str, Candidate] = {}
-    for band, warped in zip(estimate.bands, held_out, strict=True):
-        result |= estimate.accepted_candidate(band, warped)
+    result = estimate.accepted_candidates(zip(estimate.bands, held_out, strict=True))
     if not _is_relief_accepted(estimate.bands, result):
         return {}
     result |= estimate.of_other_bands(others)
@@ -410,30 +408,30 @@ class _Estimate:
         relief does not verify a band that it is estimated from.
         """
         names, reference = {band.name for band in self.bands}, self.bands[0].refined.pair.reference
-        result: dict[str, Candidate] = {}
+        under: list[tuple[_Band, WarpedPair]] = []
         for other in others:
             pair = other.pair
             if pair.name in names or pair.is_coarse or pair.reference is not reference:
                 continue
             with suppress(GeometryError):
                 band = self.band_under_relief(other)
-                result |= {} if band is None else self.accepted_candidate(band, band.held_out(self.relief))
-        return result
+                under += [] if band is None else [(band, band.held_out(self.relief))]
+        return self.accepted_candidates(under)
 
-    def accepted_candidate(self, band: _Band, held_out: WarpedPair) -> dict[str, Candidate]:
-        """Return the candidate of a band by the relief of all bands, with its name, and with its held-out windows.
+    def accepted_candidates(self, bands: Iterable[tuple[_Band, WarpedPair]]) -> dict[str, Candidate]:
+        """Return the candidates of bands by the relief of all bands, given the held-out windows of each.
 
-        Empty if the checks find issues, and the candidate may not predict, its windows are few, or half of them are not
-        aligned.
+        One with issues is left out if it may not predict, its windows are few, or half of them are not aligned.
         """
-        mapping = band.mapping(self.relief, with_occlusions=True)
-        candidate = band.candidate(mapping, held_out)
-        residual = candidate.residual
-        is_known = len(residual.measured_px) >= MIN_WINDOWS
-        is_known &= residual.median_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px
-        if not candidate.issues or (is_known and candidate.may_predict):
-            return {band.name: candidate}
-        return {}
+        result: dict[str, Candidate] = {}
+        for band, held_out in bands:
+            candidate = band.candidate(band.mapping(self.relief, with_occlusions=True), held_out)
+            residual = candidate.residual
+            is_known = len(residual.measured_px) >= MIN_WINDOWS
+            is_known &= residual.median_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px
+            if not candidate.issues or (is_known and candidate.may_predict):
+                result[band.name] = candidate
+        return result
 
 
 def _with_field_on_relief(candidate: Candidate) -> Candidate:

@@ -67,13 +67,15 @@ class Candidate:
         """What the checks find; empty if it passes verification."""
         if self.given_issues is not None:
             return self.given_issues
-        pixel_px = self.pair.file_pixel_size_px
-        found = issues_of(self.mapping, self.error, self.residual, self.joint, self.common_px, pixel_px)
-        issues = found or self._issues_of_pixels
+        issues = self._issues_by(self.residual, self.error) or self._issues_of_pixels
         if issues or self.other_residual is None:
             return issues
-        error = replace(self.error, residual=self.other_residual)
-        return replace(self, residual=self.other_residual, error=error, other_residual=None).issues
+        return self._issues_by(self.other_residual, replace(self.error, residual=self.other_residual))
+
+    def _issues_by(self, residual: Residual, error: MappingError) -> tuple[Issue, ...]:
+        """What the checks without pixels find by some windows."""
+        pixel_px = self.pair.file_pixel_size_px
+        return issues_of(self.mapping, error, residual, self.joint, self.common_px, pixel_px)
 
     @property
     def _issues_of_pixels(self) -> tuple[Issue, ...]:
