@@ -5,8 +5,8 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 
@@ -74,11 +74,13 @@ def index_tasks(
     sidecars = counted_sidecars(run_sidecars(out), out)
     task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, RunFacts.of(out))
     tasks = [replace(task, sidecar=path, file_states=states) for path, states in sidecars.items()]
-    taken: dict[str, str] = {}
+    taken: dict[str, tuple[str, Index]] = {}
     for label, index in itertools.product((task.label for task in tasks), indices):
-        if (other := taken.setdefault(f"{label}_{index.name}", label)) != label:
-            remedy = f"give the formula '{index.name}' another name"
-            raise ConfigurationError(f"{label}_{index.name}.tif: would be an index of {other} and of {label}; {remedy}")
+        other, of_other = taken.setdefault(f"{label}_{index.name}".lower(), (label, index))
+        if other != label:
+            formula = next(one.name for one in (index, of_other) if one.is_of_user)
+            what = f"{label}_{index.name}.tif: would be an index of {other} and of {label}"
+            raise ConfigurationError(f"{what}; give the formula '{formula}' another name")
     if target != out and target.is_dir():
         _refuse_indices_of_others(tasks)
     return tasks
@@ -140,9 +142,9 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
             files = ListedFiles.of(sidecar, task.sidecar.parent, task.file_states)
-            more: dict[str, Any] = {"overwrite": task.overwrite, "samples": sidecar.own_samples}
+            written = partial(write_index, overwrite=task.overwrite, samples=sidecar.own_samples)
             with BandReader(files) as reader:
-                reports = [write_index(reader, bands, index, base, task.label, **more) for index in task.indices]
+                reports = [written(reader, bands, index, base, task.label) for index in task.indices]
             if task.target == task.out:
                 listed = {part.file for part in sidecar.products}
                 # A command that was killed may have written a raster that the sidecar does not list.

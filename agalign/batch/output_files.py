@@ -85,8 +85,8 @@ def refuse_to_overwrite(
             found = names.found(path, capture) or (
                 _sidecar(path, capture, out, once) if path == sidecar else _file(path, listed)
             )
-            if path in indices and kind != IndexRasters.kind and found[0].written != "refuse":
-                message = f"{path}: is an index, which another output would replace"
+            if path in indices and kind != IndexRasters.kind and found[0] is not State.NO_FILE:
+                message = f"{path}: is an index, which another output of this name would replace"
                 found = State.INDEX, f"{message}; delete it, or choose another output folder with -o"
             state, message = found
             if (state.written if is_written else state.not_written) == "refuse":

@@ -18,7 +18,7 @@ from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoSuchBandError
 from agalign.host.text import counted
-from agalign.pixels.coordinates import transformed
+from agalign.pixels.coordinates import metres_per_unit, transformed
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
 from agalign.values.arguments import checked
@@ -223,23 +223,29 @@ def mosaics_onto(
 
 
 def mosaics_apart_km(fixed: Band, moving: Band) -> float:
-    """Return the distance between the centres of two georeferenced rasters on the ground; 0 if they may overlap, as in
-    a local CRS, whose place on Earth is unknown.
+    """Return the distance between the centres of two georeferenced rasters on the ground; 0 if they may overlap.
+
+    Raises GeometryError if their coordinates are in different systems that GDAL cannot transform.
     """
-    centres, half_diagonals_km = [], 0.0
+    places, systems = [], []
     for band in (fixed, moving):
         assert band.georeference is not None
         width, height = band.size_px
-        on_map = geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]]))
-        try:
-            on_earth = transformed(on_map, band.georeference.crs_wkt, "EPSG:4326").tolist()
-        except GeometryError:
-            return 0.0
-        centre, corner = (Position(latitude, longitude) for longitude, latitude in on_earth)
-        centres.append(centre)
-        half_diagonals_km += distance_km(centre, corner)
-    result_km = distance_km(*centres)
-    return result_km if result_km > half_diagonals_km else 0.0
+        places.append(geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]])))
+        systems.append(band.georeference.crs_wkt)
+    try:
+        on_earth = [transformed(*place, "EPSG:4326") for place in zip(places, systems, strict=True)]
+        (centre, corner), (other, its_corner) = ([Position(*at[::-1]) for at in p.tolist()] for p in on_earth)
+        result_km, *half_diagonals_km = (
+            distance_km(*p) for p in ((centre, other), (centre, corner), (other, its_corner))
+        )
+    except GeometryError:
+        if systems[0] != systems[1]:
+            raise
+        # A local system, whose place on Earth is unknown.
+        offsets = places[1][0] - places[0][0], *(place[1] - place[0] for place in places)
+        result_km, *half_diagonals_km = (float(np.hypot(*o)) * metres_per_unit(systems[0]) / 1000 for o in offsets)
+    return result_km if result_km > sum(half_diagonals_km) else 0.0
 
 
 def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:

@@ -503,9 +503,10 @@ def _std_px(reliefs: Sequence[Relief], max_std_px: float) -> FloatImage:
     reliefs from different bands differ at depth edges and in areas without texture, by values that single pixels do not
     have in common. It approaches `max_std_px`, as the harmonic sum of both variances.
 
-    The median of such an error, whose square has a chi-squared distribution with n - 1 degrees of freedom, is smaller
-    than its RMS, the more so the fewer reliefs there are. It has the scale of four, by which 0.71 of the windows of a
-    bench with plants and a boom, and 0.77 of those of bananas, are within the expected error, and 0.95 within twice it.
+    The squares have a chi-squared distribution with n - 1 degrees of freedom: their median is smaller than their mean,
+    the more so the fewer reliefs there are. The result is scaled to the median that four reliefs have: with it, 0.71 of
+    the windows of a bench with plants and a boom, and 0.77 of those of bananas, are within the expected error, and 0.95
+    within twice it.
     """
     surroundings_px = 17  # about the distance of the nodes of an error map (NODES_PX), and odd
     values = np.stack([relief.parallax_px for relief in reliefs])

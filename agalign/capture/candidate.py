@@ -195,15 +195,15 @@ class RefinedBand:
         """Yield the homography, then the same with a displacement field if that passes too.
 
         A field is fitted if parallax may cause all issues of the homography, or if there are none and no rig contains
-        the distortion of the lenses; with `use` "always" also if one does, with "never" not at all. Input that is
-        aligned already only gets a field that improves it.
+        the distortion of the lenses; with `use` "always" also if one does, with "never" not at all. With "auto", input
+        that is aligned already only gets a field that improves it.
         """
         band = self._unchanged_if_aligned
         joint, verified = band.joint, band.verified
         plane = Candidate.of(verified, joint)
         is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not self.pair.has_rig))
         if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
-            yield from _with_field(plane, verified, joint, is_aligned_input=band is not self)
+            yield from _with_field(plane, verified, joint, is_aligned_input=use == "auto" and band is not self)
         else:
             yield plane
 
@@ -232,8 +232,10 @@ def _with_field(
     plane: Candidate, warped: WarpedPair, joint: JointResult, *, is_aligned_input: bool
 ) -> Iterator[Candidate]:
     """Yield the homography with the p95 of both geometries, then the same with a displacement field, verified by
-    windows that it is not fitted to; without it if it increases their p95 too much, or if only the homography passes,
-    or if it is given by the files, passes, and the field decreases the shifts by no more than chance.
+    windows that the field is not fitted to.
+
+    The field is left out if it increases their p95 too much, or if only the homography passes. Input that is aligned
+    already, and passes, gets one only if it decreases the shifts by more than chance.
     """
     min_decrease = 4.0  # standard errors, as that of a relief
     pair = plane.pair

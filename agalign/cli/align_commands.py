@@ -12,6 +12,7 @@ from agalign.batch.preload import preload_libraries
 from agalign.cli.command import Command, Given
 from agalign.cli.config_file import load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
+from agalign.errors import GeometryError
 from agalign.host.processes import cores_for
 from agalign.host.text import counted
 from agalign.values.choices import MAX_MOSAIC_PIXELS
@@ -48,7 +49,7 @@ def _align(
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.spectral_indices.formulas import chosen_indices
 
-    source = folder.resolve() if folder.name == ".." else folder.absolute()  # a link keeps its name
+    source = folder.absolute() if folder.is_symlink() else folder.resolve()  # results are beside a link
     target = out or source.parent / f"{source.name}-aligned"
     settings = Settings.model_validate(given["settings"])
     dask = given["run"].pop("executor")
@@ -169,9 +170,13 @@ def _onto(
     flight = mosaics_onto(reference, moving, band, given["discover"]["max_pixels"])
     check_products([reference, *moving])
     for capture in flight.captures:
-        offset_km = mosaics_apart_km(capture.reference, capture.moving[0])
+        path = capture.moving[0].path
+        try:
+            offset_km = mosaics_apart_km(capture.reference, capture.moving[0])
+        except GeometryError as error:
+            terminal.problem(f"{path}: cannot be compared with the reference by its {error}", file=path)
+            continue
         if offset_km:
-            path = capture.moving[0].path
             terminal.problem(f"{path}: is {offset_km:,.1f} km away from the reference, by its coordinates", file=path)
     totals = run(flight, target, settings, terminal, RunOptions(**given["run"], align_panels=True))
     return conclude(totals, target, terminal)

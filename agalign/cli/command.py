@@ -9,7 +9,7 @@ import copy
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
@@ -22,7 +22,7 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from agalign.cli.terminal import Terminal, exits
-from agalign.errors import ConfigurationError, WorkerError
+from agalign.errors import WorkerError
 from agalign.host.files import path_problem
 from agalign.host.processes import address_space_problem
 
@@ -99,11 +99,14 @@ def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str 
     return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, info])
 
 
-def _path(text: str) -> Path:
-    """Return a path; an empty name, as of a shell variable that is not set, would be the working folder."""
-    if not text:
-        raise typer.BadParameter("is empty; give a path")
-    return Path(text)
+def _path(text: Any) -> Path:
+    """Return the path of a local file or folder; an empty name, as of a shell variable that is not set, would be the
+    working folder.
+    """
+    path = Path(str(text))  # a configuration file may have a number
+    if problem := path_problem(path) if text else "is empty; give a path":
+        raise typer.BadParameter(problem)
+    return path
 
 
 def value_name(kind: Any) -> str:
@@ -170,7 +173,6 @@ class Command:
         def call(**values: Any) -> None:
             terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
             with exits(terminal, self.on_interrupt, values.get("config")):
-                _check_paths(values.values())
                 if "device" in fields and (problem := address_space_problem()):
                     raise WorkerError(problem)
                 given: Given = {}
@@ -188,14 +190,6 @@ class Command:
         epilog = "\n\n".join(["Examples:", *map(_highlighted, examples)]) if examples else None
         app.command(self.name, cls=cls, epilog=epilog, hidden=bool(self.alias))(call)
         return typer.main.get_command(app)
-
-
-def _check_paths(values: Iterable[Any]) -> None:
-    """Raise ConfigurationError for a path among the values of a command that cannot be that of a local file."""
-    for value in values:
-        for path in value if isinstance(value, list) else [value]:
-            if isinstance(path, Path) and (problem := path_problem(path)):
-                raise ConfigurationError(problem)
 
 
 def _highlighted(example: str) -> str:

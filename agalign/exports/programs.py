@@ -139,8 +139,8 @@ def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *
             )
         if capture.result.write_options.get("format") == "cog":
             raise ConfigurationError(
-                f"{out}: has cloud-optimised files, without the tags of the camera that other programs need; "
-                "run 'agalign' with --format gtiff into it, and export again"
+                f"{out}: the files of {capture.label} are cloud-optimised, without the tags of the camera that other "
+                "programs need; run 'agalign' with --format gtiff into it, and export again"
             )
         for file in files:
             source = check_inside(file, out)

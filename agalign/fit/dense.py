@@ -165,21 +165,23 @@ class DenseMatching:
 
 
 def nearer_sign(relief: Relief, baselines: NDArray[np.float64]) -> int:
-    """Return 1 if positive parallax is nearer to the camera, else -1.
+    """Return 1 if positive parallax is nearer to the camera, or if that is unknown, and -1 if negative parallax is.
 
     Where two surfaces are displaced to the same position, only pixels of the nearer one match. With the wrong sign,
-    pixels with a high correlation would be occluded. If either sign occludes nothing, the given one is kept: it
-    matters for occlusions only. `baselines` (bands, 2): displacement (x, y) of each band, px, by a parallax of 1.
+    pixels with a high correlation would be occluded. `baselines` (bands, 2): displacement (x, y) of each band, px, by a
+    parallax of 1.
     """
+    min_occluded_share = 0.0005  # fewer pixels may be wrong matches: 400 of a megapixel
+    min_correlation_difference = 0.03  # smaller ones may be chance
     means = []
     for sign, signed_relief in ((1, relief), (-1, relief.negated)):
         hidden = np.zeros(relief.parallax_px.shape, bool)
         for x, y in (sign * baselines).tolist():
             hidden |= np.asarray(Parallax(signed_relief, (x, y)).with_occlusions().hidden)
-        if not hidden.any():
+        if np.count_nonzero(hidden) < min_occluded_share * hidden.size:
             return 1
         means.append(float(relief.confidence[hidden].mean()))
-    return 1 if means[0] <= means[1] else -1
+    return -1 if means[0] - means[1] > min_correlation_difference else 1
 
 
 def _semi_global_match(

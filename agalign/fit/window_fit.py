@@ -15,7 +15,8 @@ weights reduce the influence of wrong correlation peaks and of windows across de
 
 Two ambiguities are removed. A plane a + b x + c y added to z is equivalent to other homographies of all bands: z is 0
 on the plane that contains most windows. The scale of z is free: the longest baseline has length 1. If the lens layout
-is known, positive parallax is nearer to the camera, else its mean is positive: most objects are nearer than the plane.
+is known, positive parallax is nearer to the camera. Else its mean is positive, as most objects are nearer than the
+plane, until occlusions show the opposite (`dense.nearer_sign`).
 """
 
 import math

@@ -147,7 +147,7 @@ def capture_factors(design: Array, differences: Array, weights: Array) -> Estima
 
     `differences` (n, k, 2, 3) are the coefficients of the mappings of k bands minus the mean, px, and `design`
     (k, 2, 3, 5) their derivative with respect to the factors. `weights` (n, k) are from `mapping_weight`, 0 without a
-    mapping.
+    mapping. The residuals are divided by the errors of the mappings, relative to an accurate one.
     """
     # Residual of an accurate mapping at which its robust weight is one half; others are scaled by their errors.
     half_weight_px = 0.3

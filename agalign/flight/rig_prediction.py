@@ -114,8 +114,8 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Predic
 
     The variance is the sum of the cross-validated one, the additional variance of the factors compared with captures in
     which all other bands are known accurately, that by the baseline's error for factors outside the learned range, and
-    the excess residual of the other bands (the median square minus the cross-validated variance), which is large for a
-    capture that the rig does not describe.
+    the excess residual of the other bands (the median of their squares minus the cross-validated variance and that of
+    their own errors), which is large for a capture that the rig does not describe.
     """
     others = [b for b in rig.mean if b != band]
     std_px = [known.std_px[b] if b in known.mappings else math.inf for b in others]
@@ -194,8 +194,8 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Pre
     """Predict a band from the estimate of the capture's factors with the smallest standard error, px.
 
     That is the leave-one-out error of the basis for learned captures with similar gaps, or the difference between
-    the captures used if that is larger; if the distance is not interpolated over the altitude, with the error by an
-    altitude that no learned capture has. A gap of more than _MAX_GAP_RATIO times those of all learned captures is not
+    the captures used if that is larger. A basis other than the altitude also has the error by the distance from the
+    altitudes of the learned captures. A gap of more than _MAX_GAP_RATIO times those of all learned captures is not
     validated: the flight's mean remains.
     """
     min_for_altitude = 6  # with fewer captures, the basis with the smallest error would be selected by chance

@@ -57,6 +57,11 @@ def crs_wkt(code: str) -> str:
     return str(rasterio.CRS.from_user_input(code).to_wkt())
 
 
+def metres_per_unit(crs: str) -> float:
+    """Return the unit of the coordinates of a CRS (WKT or EPSG:number), which is not one of degrees, m."""
+    return float(rasterio.CRS.from_user_input(crs).units_factor[1])
+
+
 def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
     """Transform map coordinates (n, 2), x or longitude first, to another CRS (WKT or EPSG:number).
 

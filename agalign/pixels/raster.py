@@ -29,7 +29,7 @@ from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
-from agalign.values.spectrum import role_of
+from agalign.values.spectrum import is_spectral
 
 _MAXIMA = {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}
 """Of the types that sensors deliver."""
@@ -165,7 +165,7 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
             dtype=dataset.dtypes[i - 1],
             nodata=dataset.nodatavals[i - 1],
             has_mask=has_mask,
-            wavelength_nm=_wavelength_nm(dataset.tags(i) | dataset.tags(i, ns="IMAGERY")),
+            wavelength_nm=_wavelength_nm(dataset, i),
             saturation_value=_full_scale(dataset, i),
             georeference=georeference,
             scale_offset=(dataset.scales[i - 1], dataset.offsets[i - 1]),
@@ -344,13 +344,13 @@ def _has_mask(dataset: rasterio.DatasetReader, index: int) -> bool:
 def _alpha_index(dataset: rasterio.DatasetReader) -> int | None:
     """Return the index of the alpha band of a file of several bands, from 1; None without one.
 
-    Programs mark the fourth band of an image as alpha also if its name is that of a spectral band.
+    Programs mark the fourth band of an image as alpha also if it is a spectral one.
     """
     colours = dataset.colorinterp
     if len(colours) < 2 or ColorInterp.alpha not in colours:
         return None
-    index = colours.index(ColorInterp.alpha)
-    return index + 1 if role_of(dataset.descriptions[index] or "", None) is None else None
+    index = colours.index(ColorInterp.alpha) + 1
+    return None if is_spectral(dataset.descriptions[index - 1] or "", _wavelength_nm(dataset, index)) else index
 
 
 def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:
@@ -363,8 +363,9 @@ def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:
     return Georeference(transform, dataset.crs.to_wkt())
 
 
-def _wavelength_nm(tags: dict[str, str]) -> float | None:
-    """Return the wavelength of a band from the tags of ENVI, GDAL's IMAGERY domain or agalign."""
+def _wavelength_nm(dataset: rasterio.DatasetReader, index: int) -> float | None:
+    """Return the wavelength of a band, from 1, from the tags of ENVI, GDAL's IMAGERY domain or agalign."""
+    tags = dataset.tags(index) | dataset.tags(index, ns="IMAGERY")
     # Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100
     # nm.
     max_micrometres = 20.0

@@ -254,8 +254,9 @@ def _descriptions(context: ProductContext, layers: Sequence[Layer]) -> list[Laye
     for layer, colour in zip(layers, _colours(layers), strict=True):
         band = layer.band
         quantity = None if raw or band.radiometry is None else band.radiometry.quantity
-        # The bands of a photograph have no calibration: the quantity of the file is not theirs.
-        tags, imagery = {"QUANTITY": quantity or RAW} if is_calibrated else {}, {}
+        # A band without calibration, as of a photograph, has not the quantity of the file.
+        known = quantity or ("" if layer.is_gap else RAW)
+        tags, imagery = {"QUANTITY": known} if is_calibrated and known else {}, {}
         if layer.is_gap:
             alignment = context.alignments.get(band.name)
             why_missing = str(context.capture.unreadable_bands.get(band.name, MISSING_BAND.cause))

@@ -282,7 +282,7 @@ def write_index(
         may_be_kept = not overwrite and all(band.sha256 for band in chosen)
         earlier = _finished_before(target, source, reader.listed) if may_be_kept else None
         if earlier is None:
-            _refuse(target, index, bands)
+            _refuse_to_replace(target, index, bands)
         if not overwrite and (change := reader.listed.problem(target)) and IndexRaster.complete(target) is not None:
             raise InputError(f"{change}; --overwrite replaces it")
         statistics = earlier or _write(index, chosen, target, source, reader, samples)
@@ -292,7 +292,7 @@ def write_index(
     return IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
 
 
-def _refuse(target: Path, index: Index, bands: Sequence[AlignedBand]) -> None:
+def _refuse_to_replace(target: Path, index: Index, bands: Sequence[AlignedBand]) -> None:
     """Raise InputError for a file that an index may not replace."""
     remedy = f"give the formula '{index.name}' another name"
     if target.resolve() in {band.file.resolve() for band in bands}:
@@ -300,7 +300,7 @@ def _refuse(target: Path, index: Index, bands: Sequence[AlignedBand]) -> None:
     if file := _foreign_file(target):
         raise InputError(foreign(file, "choose another folder with -o"))
     if (other := tags_of(target).get("INDEX", index.name)) != index.name:
-        raise InputError(f"{target}: is the index '{other}' of another capture; {remedy}")
+        raise InputError(f"{target}: is the index '{other}', not '{index.name}'; {remedy}")
 
 
 def _foreign_file(raster: Path) -> Path | None:

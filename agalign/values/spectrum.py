@@ -53,6 +53,15 @@ def role_of(name: str, wavelength_nm: float | None) -> Role | None:
     return None if contradicts(name, wavelength_nm) else role_of_wavelength(wavelength_nm)
 
 
+def is_spectral(name: str, wavelength_nm: float | None) -> bool:
+    """Return True for a band with a wavelength or the name of a part of the spectrum, also with a number."""
+    word = re.sub(r"[\s_-]*\(?\d.*$", "", name)
+    has_name = word.lower().startswith(("pan", "lwir", "thermal", "infrared")) or (
+        _role_of_name(name if len(word) < 2 else word) is not None  # "N" is one, "B4" may be any fourth band
+    )
+    return wavelength_nm is not None or has_name
+
+
 def role_of_wavelength(wavelength_nm: float) -> Role | None:
     """Return the role with this centre wavelength; None for wavelengths between the roles."""
     return next((role for role, r in ROLES.items() if r.shortest_nm <= wavelength_nm <= r.longest_nm), None)

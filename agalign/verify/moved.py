@@ -250,11 +250,12 @@ def _refined(
     known: dict[tuple[int, int], FloatImage] = {}
     steps = -1, 0, 1
     while True:  # few steps, from a shift measured at every second pixel
+        is_at_end = max(abs(x), abs(y)) > _SEARCH_PX
         for shift in ((x + dx, y + dy) for dy in steps for dx in steps):
             if shift not in known:
                 known[shift] = pair.under(shift, area)
         means = np.array([[known[x + dx, y + dy][where].mean() for dx in steps] for dy in steps], np.float64)
-        if not means.max() > means[1, 1]:
+        if is_at_end or not means.max() > means[1, 1]:
             return np.array([x, y]) + paraboloid_peaks(means[None])[0], known[x, y]
         row, column = divmod(int(means.argmax()), 3)
         x, y = x + column - 1, y + row - 1

@@ -129,7 +129,7 @@ def too_long(case: Case) -> Case:
         (of_user, State.OF_USER, "was not written by agalign", "keep"),
         (folder, State.OF_USER, "was not written by agalign", "keep"),
         (of_user_in_an_edited_sidecar, State.OF_USER, "was not written by agalign", "keep"),
-        (index, State.INDEX, "is an index, which another output would replace", "remove"),
+        (index, State.INDEX, "is an index, which another output of this name", "remove"),
         (other_result, State.OTHER_RESULT, "belongs to a different capture", "belongs to a different capture"),
         (image, State.IMAGE, "is an image to be aligned", "is an image to be aligned"),
         (taken, State.TAKEN, "would be written of f and of F", "would be written of f and of F"),
@@ -153,6 +153,13 @@ def test_what_is_there_decides(
         assert os.path.lexists(path) is (existed and not_written == "keep")
     actions = [a if a in ("write", "keep", "remove") else "refuse" for a in (written, not_written)]
     assert [state.written, state.not_written] == actions
+
+
+@pytest.mark.slow
+def test_an_index_that_is_deleted_as_advised_is_no_obstacle(case: Case) -> None:
+    path, captures = index(case)
+    path.unlink()
+    refuse_to_overwrite(captures, path.parent, WRITING)
 
 
 def test_the_cases_cover_every_state() -> None:

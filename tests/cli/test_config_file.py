@@ -53,6 +53,7 @@ def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path) ->
         ("out = 1979-05-27", "'out' takes a text or number"),
         ("qa = ''", "'qa' takes true or false"),
         ("timeout = inf", "--timeout: "),
+        ("out = ''", "--out: is empty; give a path"),
         ("ground-elevation = nan", "--ground-elevation: "),
         (f"jobs = {2**63}", "--jobs: "),
         ("x = " + "[" * 9999 + "]" * 9999, "cannot be read as TOML"),

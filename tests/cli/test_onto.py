@@ -147,7 +147,15 @@ def test_mosaics_in_a_local_reference_system_are_aligned(mosaics: Path, tmp_path
         with rasterio.open(mosaics / f"{name}.tif") as source:
             in_metres = {**source.profile, "crs": rasterio.CRS.from_wkt(f'{local},AXIS["Y",NORTH]]')}
             write_band(tmp_path / f"{name}.tif", source.read(), **in_metres)
-    assert onto(tmp_path, tmp_path / "summer.tif", tmp_path / "out").returncode == 0
+    done = onto(tmp_path, tmp_path / "summer.tif", tmp_path / "out")
+    assert (done.returncode, "away from the reference" in done.stderr) == (0, False)
+    with rasterio.open(tmp_path / "summer.tif", "r+") as source:
+        source.transform = Affine.translation(0, 20_000) * source.transform
+    nowhere = "--device", "cuda:99"
+    far = agalign_here("onto", tmp_path / "spring.tif", tmp_path / "summer.tif", "-o", tmp_path / "far", *nowhere)
+    assert re.search(r"summer\.tif: is (19|20)\.\d km away from the reference", far.stderr)
+    other = agalign_here("onto", mosaics / "spring.tif", tmp_path / "summer.tif", "-o", tmp_path / "far", *nowhere)
+    assert "summer.tif: cannot be compared with the reference by its coordinates" in other.stderr
 
 
 @pytest.mark.full

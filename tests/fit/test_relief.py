@@ -90,10 +90,11 @@ def test_pixels_that_match_are_nearer(sign: int) -> None:
     assert nearer_sign(matched(sign), BASELINES) == sign
 
 
-def test_the_sign_is_kept_without_occlusions() -> None:
+def test_the_sign_is_kept_without_evidence() -> None:
     assert nearer_sign(layers(near_px=0.0), BASELINES) == 1
     small = Relief(layers(slice(20, 22), slice(30, 32)).parallax_px, matched(-1).confidence)
     assert nearer_sign(small, BASELINES / 6) == 1
+    assert nearer_sign(matched(-1, behind=0.88), BASELINES) == 1
 
 
 # ---- range of two planes from a rig with known positions and orientations of the lenses

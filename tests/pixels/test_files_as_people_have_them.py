@@ -183,19 +183,27 @@ def test_an_alpha_band_is_the_mask_of_any_number_of_bands(tmp_path: Path, bands:
         assert not read_for_alignment(band, 160).valid[:, :48].any()
 
 
-def test_a_near_infrared_band_that_is_marked_as_alpha_is_a_band(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "is_band"), [("NIR", True), ("NIR 840", True), ("LWIR", True), ("Alpha", False), ("B4", False)]
+)
+def test_a_spectral_band_that_is_marked_as_alpha_is_a_band(tmp_path: Path, name: str, is_band: bool) -> None:
     """As programs export four bands: the fourth of an RGB image."""
     planes = np.stack([texture_numbers(seed=k) for k in range(4)])
     planes[3, :, :100] = 0
     write_band(tmp_path / "a.tif", planes)
     with rasterio.open(tmp_path / "a.tif", "r+") as file:
         file.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
-        file.descriptions = "Red", "Green", "Blue", "NIR"
-    (*_, nir) = stored = probe(tmp_path / "a.tif")
-    assert [(b.name, b.has_mask) for b in stored] == [(name, False) for name in ("Red", "Green", "Blue", "NIR")]
-    pixels, valid = read_tile(nir, Tile(0, 0, 320, 240))
-    np.testing.assert_array_equal(pixels, planes[3])
-    assert valid.all()
+        file.descriptions = names = "Red", "Green", "Blue", name
+    stored = probe(tmp_path / "a.tif")
+    assert [(b.name, b.has_mask) for b in stored] == [(one, not is_band) for one in names[: 3 + is_band]]
+    _, valid = read_tile(stored[0], Tile(0, 0, 320, 240))
+    assert valid.all() == is_band
+    if is_band:
+        np.testing.assert_array_equal(read_tile(stored[3], Tile(0, 0, 320, 240))[0], planes[3])
+    else:
+        with rasterio.open(tmp_path / "a.tif", "r+") as file:
+            file.update_tags(4, wavelength="840")
+        assert len(probe(tmp_path / "a.tif")) == 4
 
 
 @pytest.mark.parametrize(("name", "dtype"), [("f.tif", "uint8"), ("f_RGB.tif", "uint8"), ("f_RGB.tif", "uint16")])

@@ -333,12 +333,12 @@ def test_a_formula_does_not_replace_the_index_of_another_capture(tmp_path: Path)
     write_signed(second.with_name("IMG_0001_b.json"), second.read_text().replace("IMG_0002", "IMG_0001_b"))
     second.with_suffix(".tif").rename(second.with_name("IMG_0001_b.tif"))
     second.unlink()
-    with pytest.raises(ConfigurationError, match=r"IMG_0001_b_ndvi\.tif: would be an index of .*IMG_0001 and of"):
+    with pytest.raises(ConfigurationError, match=r"IMG_0001_b_ndvi\.tif: would be an index of .*'b_ndvi' another"):
         indices_of(tmp_path, "ndvi", formula)
     (ndvi,) = (report for report in indices_of(tmp_path, "ndvi") if report.path.name == "IMG_0001_b_ndvi.tif")
     before = ndvi.path.read_bytes()
     problem = next(report.problem for report in indices_of(tmp_path, formula) if report.problem)
-    assert "is the index 'ndvi' of another capture; give the formula 'b_ndvi' another name" in problem
+    assert "is the index 'ndvi', not 'b_ndvi'; give the formula 'b_ndvi' another name" in problem
     assert ndvi.path.read_bytes() == before
 
 
