@@ -117,6 +117,15 @@ class Candidate:
         relief_std_px = max(relief_std_px, self.error.relief_std_px)
         return replace(self, error=replace(self.error, relief_std_px=relief_std_px))
 
+    @property
+    def with_second_layer(self) -> "Candidate":
+        """The candidate with at least the RMS shift of a second layer of the images, if they have one, as its error."""
+        layer = None if self.images is None or self.given_issues is not None else self.images.second_layer
+        lacking_px2 = 0.0 if layer is None else layer.rms_px**2 - self.std_px**2
+        if not lacking_px2 > 0:
+            return self
+        return replace(self, error=replace(self.error, rig_std_px=math.hypot(self.error.rig_std_px, lacking_px2**0.5)))
+
     @cached_property
     def common_px(self) -> Points:
         """Points (n, 2) of a grid over the reference that the moving image covers."""

@@ -133,14 +133,16 @@ def _of_images(band: BandCandidates, relief: UnderRelief) -> _Choice:
         return _Choice(band, None, band.rejected, is_seed_refused=True)
     under = relief.get(band.pair.name)
     if under is not None:
-        return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues_of_prediction) if under.issues else ())
+        if not under.issues:
+            return _Choice(band, under, ())
+        return _Choice(band, under.with_second_layer, (Issue(OTHER_GEOMETRY), *under.issues_of_prediction))
     if accepted := band.accepted:
         is_beside = any(other.pair.reference is band.pair.reference for other in relief.values())
         return _Choice(band, accepted[-1], (Issue(OTHER_GEOMETRY),) if is_beside else ())
     predicting = [candidate for candidate in band.candidates if candidate.may_predict]
     if predicting:
-        best = min(predicting, key=lambda candidate: candidate.std_px)
-        return _Choice(band, best, best.issues_of_prediction)
+        best = min(predicting, key=lambda candidate: candidate.with_second_layer.std_px)
+        return _Choice(band, best.with_second_layer, best.issues_of_prediction)
     return _Choice(band, None, band.rejected)
 
 

@@ -17,7 +17,15 @@ from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
-from agalign.verify.checks import AliasPeak, alias_peaks, content_issues, repetition_issues
+from agalign.verify.checks import (
+    AliasPeak,
+    Layer,
+    alias_peaks,
+    content_issues,
+    layer_issues,
+    repetition_issues,
+    second_layer,
+)
 from agalign.verify.coverage import points_in_frame, points_in_mask, unobserved_quarters
 
 
@@ -91,6 +99,11 @@ class WarpedPair:
         return alias_peaks(reference.seed_spectrum, moving, reference.seed_scale)
 
     @cached_property
+    def second_layer(self) -> Layer | None:
+        """Structure of the moving image that fits another shift."""
+        return second_layer(self.pair.windows.mean_correlation(self.warped))
+
+    @cached_property
     def issues(self) -> tuple[Issue, ...]:
         """What the checks of the pixels find."""
         usual = self.pair.windows  # they cover the image once
@@ -98,6 +111,7 @@ class WarpedPair:
         is_expected = partial(self.pair.is_expected, self.mapping.fixed_to_moving)
         return (
             *content_issues(residual, self.pair.file_pixel_size_px),
+            *layer_issues(self.second_layer),
             *repetition_issues(self.alias_peaks, is_expected),
         )
 

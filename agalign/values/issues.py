@@ -80,6 +80,11 @@ CLOSE_WINDOWS = IssueKind(
     "close_windows", "only {value:.1%} of the windows are aligned within {detail}", remedies.PARALLAX
 )
 CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", remedies.PARALLAX)
+SECOND_LAYER = IssueKind(
+    "second_layer",
+    "about {value:.0%} of the structure fits another shift ({detail}), in parts that are smaller than the windows",
+    remedies.PARALLAX,
+)
 UNEXPECTED_PX = IssueKind(
     "unexpected_px",
     "the result is {value:.1f} px from the position that the rig of the flight predicts",
@@ -91,7 +96,7 @@ REPEATS = IssueKind(
     remedies.REPETITIVE,
 )
 
-BY_PARALLAX = frozenset((CLOSE_WINDOWS, CLUSTER, INACCURATE, UNMEASURED))
+BY_PARALLAX = frozenset((CLOSE_WINDOWS, CLUSTER, INACCURATE, UNMEASURED, SECOND_LAYER))
 """Kinds of issues that parallax may cause, which a relief or a displacement field removes."""
 PREDICTED_WITH = frozenset((*BY_PARALLAX, OTHER_CONTENT))
 """Kinds of issues of a mapping that the images confirm, but not everywhere: it predicts, with its standard error."""

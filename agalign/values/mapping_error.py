@@ -70,7 +70,7 @@ class MappingError:
     """Shifts of windows that the fit did not use, under the mapping, or under that without its displacement field on a
     relief; None if they say nothing about it."""
     rig_std_px: float = 0.0
-    """Standard error of a prediction by other bands or captures, the same everywhere."""
+    """Standard error of a prediction by other bands or captures, or by a second layer, the same everywhere."""
     lens_std_px: NDArray[np.float64] | None = None
     """(4,) standard deviations of lens shapes that neither tags nor a rig determine; None if they are known or in C."""
     field_std_px: float = 0.0

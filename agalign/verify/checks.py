@@ -6,13 +6,14 @@ pixels of the images. The worst error is a wrong alignment called `aligned`. Neg
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.pixels.structure import Field, correlation_surfaces
+from agalign.pixels.structure import Field, correlation_surfaces, inverse_transform, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import BY_WINDOWS, JointResult, Prediction
 from agalign.values.geometry import Matrix, Points
@@ -26,6 +27,7 @@ from agalign.values.issues import (
     OTHER_CONTENT,
     REPEATS,
     RETRIEVAL,
+    SECOND_LAYER,
     UNEXPECTED_PX,
     UNMEASURED,
     Issue,
@@ -50,6 +52,10 @@ thousand is aligned."""
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
 """`aligned` means an expected error of at most this in this share of the common area; that of a relief counts at the
 windows. If the RMS error is 0.5 px, 2 % of the pixels are off by more than 1 px."""
+_MAX_LAYER_SHARE, _MAX_LAYER_NOISE = 0.07, 12.0
+"""Largest share of a second layer, as such and relative to its noise. Bands of real flights have up to 0.03, with noise
+up to 0.14 and 9; half saturated ones without tags, a tenth of which is off by more than 1 px, 0.07 to 0.23 and 12 to
+20; synthetic rows of vines that are displaced from the soil by 1.5 to 5 px 0.10 to 0.46 and 17 to 41."""
 MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
 _MAX_NOISE_STD = 2.0
@@ -151,6 +157,54 @@ def _error_issues(error: MappingError, residual: Residual, common_px: Points, pi
         yield Issue(UNMEASURED, 1 - residual.coverage, 1 - _MIN_ACCURATE_SHARE)
 
 
+class Layer(NamedTuple):
+    """Structure that fits another shift than the mapping, in parts that are smaller than the windows."""
+
+    shift_px: tuple[float, float]
+    """(x, y), px of the fixed image."""
+    share: float
+    """About how much of the structure."""
+
+    @property
+    def rms_px(self) -> float:
+        """RMS error of the mapping by the layer."""
+        return math.sqrt(min(self.share, 1.0)) * math.hypot(*self.shift_px)
+
+
+def second_layer(surface: NDArray[np.float32]) -> Layer | None:
+    """Return a second layer, as of vines beside the soil, that the mean correlation surface (side, side) of windows
+    shows; its zero shift is at [0, 0].
+
+    The surface of one layer is symmetric, also if the scene repeats. What it is higher by at a shift d than at -d,
+    relative to the peak, is the share of a layer that is displaced by d. Its noise is that at larger shifts.
+    """
+    side, at_zero = len(surface), float(surface[0, 0])
+    reach = min(10, side // 4)  # px; larger shifts have peaks of their own
+    if not at_zero > 0:
+        return None
+    # Rows and columns from -reach to reach in the middle.
+    every = np.arange(1 - side % 2 - side // 2, side // 2 + 1)
+    centred = surface[np.ix_(every, every)] / at_zero
+    excess = centred - surface[np.ix_(-every, -every)] / at_zero
+    x, y = np.meshgrid(every, every)
+    min_px = 1.5  # nearer, the excess may be a small error of the mapping
+    distance_px = np.hypot(x, y)
+    is_near = (np.abs(x) <= reach) & (np.abs(y) <= reach)
+    noise = float(excess[~is_near].std())
+    candidates = np.where(is_near & (distance_px >= min_px), excess, 0)
+    row, column = np.unravel_index(int(candidates.argmax()), candidates.shape)
+    share = float(candidates[row, column])
+    if not share > max(_MAX_LAYER_SHARE, _MAX_LAYER_NOISE * noise):
+        return None
+    return Layer((float(x[row, column]), float(y[row, column])), share)
+
+
+def layer_issues(layer: Layer | None) -> Iterator[Issue]:
+    """A second layer, by its share of the structure."""
+    if layer is not None:
+        yield Issue(SECOND_LAYER, layer.share, _MAX_LAYER_SHARE, f"{math.hypot(*layer.shift_px):.0f} px")
+
+
 def content_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
     """An area with texture in both bands and no common peak shows something else. Single windows are normal.
 
@@ -224,8 +278,8 @@ def alias_peaks(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) ->
 
     They are of images that are reduced by `scale`. Without a peak at zero shift, the highest one is returned.
     """
-    surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
-    height, width = surface.shape
+    height, width = fixed.shape
+    surface = np.fft.fftshift(correlation_surfaces(fixed, moving)) / _overlap(height, width)
     row, column = height // 2, width // 2
     radius_px = 3  # of a correlation peak
     centre = np.s_[row - radius_px : row + radius_px + 1, column - radius_px : column + radius_px + 1]
@@ -236,6 +290,17 @@ def alias_peaks(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) ->
     rows, columns = np.nonzero(is_highest & (ratios > MAX_ALIAS_PEAK))
     found = zip((columns - column) / scale.x, (rows - row) / scale.y, ratios[rows, columns], strict=True)
     return sorted((AliasPeak((float(x), float(y)), float(ratio)) for x, y, ratio in found), key=lambda a: -a.ratio)
+
+
+@cache
+def _overlap(height: int, width: int) -> NDArray[np.float32]:
+    """Return the overlap of two windowed images by shift, (height, width), relative to that at zero in the middle.
+
+    Peaks of a scene that repeats are lower by it. It is at least a quarter, as smaller overlaps would amplify noise.
+    """
+    one = windowed_spectra(np.ones((1, height, width), np.complex64))
+    overlap = np.fft.fftshift(inverse_transform(np.conj(one) * one).real[0])
+    return np.asarray(np.maximum(overlap / overlap.max(), 0.25), np.float32)
 
 
 def repetition_issues(
