@@ -123,14 +123,18 @@ class FixedWindows:
 
     def mean_correlation(self, moving: Raster) -> NDArray[np.float32]:
         """Return the mean of the correlation surfaces (side, side) of every second window without invalid pixels in a
-        moving band on the reference grid; [dy, dx] is the shift. It is 0 without such windows.
+        moving band on the reference grid; [dy, dx] is the shift from the peak next to zero. It is 0 without such
+        windows.
         """
         mask, structure = _inside(moving.valid), structure_field(moving)
         complete = np.flatnonzero(self._valid_counts(self.valid & mask) >= (1 - _MAX_IGNORED_SHARE) * self.side**2)
         total = np.zeros((1, self.side, self.side), np.complex64)
         for rows, spectra in self._spectra(structure, mask, complete[::2], self._valid_counts(mask)):
             total += whitened_cross_spectra(self.spectra[rows], spectra).sum(axis=0)
-        return np.asarray(inverse_transform(total).real[0])
+        shift_px = np.clip(peak_positions(total * _low_pass(self.side, self.side), np.zeros((1, 2)))[0], -1, 1)
+        y, x = np.fft.fftfreq(self.side)[:, None], np.fft.fftfreq(self.side)
+        to_peak = np.exp(2j * np.pi * (x * shift_px[0] + y * shift_px[1])).astype(np.complex64)
+        return np.asarray(inverse_transform(total * to_peak).real[0])
 
     def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
         """Return (n, side, side) the windows with these origins, a copy."""

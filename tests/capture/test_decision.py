@@ -24,6 +24,7 @@ from agalign.values.issues import (
     FEW_KEYPOINTS,
     OTHER_CONTENT,
     RETRIEVAL,
+    SECOND_LAYER,
     SEED_ASKED_FOR,
     SEED_DOES_NOT_FIT,
     Issue,
@@ -31,6 +32,7 @@ from agalign.values.issues import (
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.residual import Residual
+from agalign.verify.checks import Layer
 from agalign.verify.coverage import pixels_in_frame
 
 from ..builders import decided, joint_result, pair_of, residual_of, rms, two_views
@@ -398,7 +400,8 @@ def test_the_rig_replaces_what_contradicts_it_and_what_is_less_certain(
 
 def test_another_scene_is_found_also_in_an_inaccurate_result() -> None:
     """Its windows contribute to the mapping, however certain this seems."""
-    seen = SimpleNamespace(issues=(Issue(OTHER_CONTENT, 0.2),), common_px=geometry.lattice(*SIZE, 12, 9))
+    facts = {"common_px": geometry.lattice(*SIZE, 12, 9), "second_layer": None}
+    seen = SimpleNamespace(issues=(Issue(OTHER_CONTENT, 0.2),), **facts)
     for images, source in ((None, "windows"), (seen, "bands")):
         result = against(rig_prediction(AT_RIG, std_px=5.0), candidate(std_px=1.0, images=images))
         assert (result.prediction.source, result.issues[0].code) == (source, "inaccurate")
@@ -406,6 +409,16 @@ def test_another_scene_is_found_also_in_an_inaccurate_result() -> None:
     relief = candidate(std_px=1.0, images=seen, relief=flat_relief())
     under = decide([BandCandidates(pair(), SEED, None, [candidate()])], [{"NIR": relief}])["NIR"]
     assert [i.code for i in under.issues] == ["other_geometry", "inaccurate", "other_content"]
+
+
+def test_a_second_layer_is_at_least_the_error_of_a_prediction() -> None:
+    """Of rows of vines, 0.25 of the image, that are 4 px off."""
+    facts = {"common_px": geometry.lattice(*SIZE, 12, 9), "second_layer": Layer((4.0, 0.0), 0.25)}
+    seen = SimpleNamespace(issues=(Issue(SECOND_LAYER, 0.25, 0.07, "4 px"),), **facts)
+    for std_px, claimed_px in ((0.1, 2.0), (5.0, 5.0)):
+        (result,) = decide([BandCandidates(pair(), SEED, None, [candidate(std_px=std_px, images=seen)])]).values()
+        assert result.status == "predicted"
+        assert result.std_px == pytest.approx(claimed_px, abs=0.01)
 
 
 def test_a_certain_prediction_by_windows_stays_within_the_error_of_an_uncertain_rig() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import agalign
+from agalign.fit.windows import FixedWindows
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry, issues
 from agalign.values.alignment import JointResult, Prediction
@@ -20,17 +21,20 @@ from agalign.values.residual import Residual
 from agalign.verify import checks
 from agalign.verify.checks import (
     AliasPeak,
+    Layer,
     alias_peaks,
     content_issues,
     is_unchanged,
     issues_of,
+    layer_issues,
     repetition_issues,
     rig_issues,
+    second_layer,
     seed_fits,
 )
 
 from ..builders import grid_px, joint_result, residual_of, texture, whole
-from ..conftest import textured_pair
+from ..conftest import textured_image, textured_pair
 
 SIZE = (1280, 960)
 JOINT = joint_result(std_px=0.07)
@@ -321,8 +325,51 @@ def test_an_expected_alias_is_an_issue_also_if_a_higher_one_is_not_expected() ->
     lattice = np.tile(rng.normal(size=(16, 16)), (4, 4)) + 0.1 * np.tile(rng.normal(size=(64, 16)), (1, 4))
     spectrum = np.fft.fft2(lattice).astype(np.complex64)
     found = alias_peaks(spectrum, spectrum)
-    assert found[0].shift_px == (-32.0, 0.0)
-    assert {(16.0, 0.0), (0.0, -16.0)} <= {peak.shift_px for peak in found}
+    assert {(-32.0, 0.0), (16.0, 0.0), (0.0, -16.0)} <= {peak.shift_px for peak in found}
+
+
+def test_a_scene_that_repeats_across_a_third_of_the_image_is_repetitive() -> None:
+    """Its peak is as much lower as the images overlap less."""
+    rng = np.random.default_rng(0)
+    tile = cv2.GaussianBlur(rng.normal(size=(240, 80)), (0, 0), 1.5)
+    scene = np.tile(tile, (1, 3))
+    fixed, moving = (
+        windowed_spectra(structure_field(whole(np.float32(scene + 0.02 * rng.normal(size=scene.shape))))) for _ in "fm"
+    )
+    assert {80.0} <= {abs(peak.shift_px[0]) for peak in alias_peaks(fixed, moving)}
+    once = windowed_spectra(
+        structure_field(whole(np.float32(cv2.GaussianBlur(rng.normal(size=(240, 240)), (0, 0), 1.5))))
+    )
+    assert alias_peaks(once, once) == []
+
+
+def layer_in(moving: np.ndarray) -> Layer | None:
+    """The second layer of a moving image of SCENE."""
+    windows = FixedWindows(np.ones(SCENE.shape, bool), structure_field(whole(SCENE)))
+    return second_layer(windows.mean_correlation(whole(np.float32(moving))))
+
+
+SCENE = textured_image(480, 360, 4).astype(np.float32)
+ROWS = np.indices(SCENE.shape)[1] % 40 < 12
+"""Three tenths of the image, in strips that are narrower than a window."""
+
+
+@pytest.mark.parametrize("shift_px", [(2.0, 0.0), (0.0, -5.0), (-3.0, 3.0)])
+def test_strips_that_are_displaced_within_the_windows_are_a_second_layer(shift_px: tuple[float, float]) -> None:
+    displaced = cv2.warpAffine(SCENE, geometry.translation(*shift_px)[:2], SCENE.shape[::-1], flags=cv2.INTER_CUBIC)
+    layer = layer_in(-np.where(ROWS, displaced, SCENE))
+    assert 0.1 < layer.share < 0.5
+    assert np.dot(layer.shift_px, shift_px) > 0.9 * np.hypot(*layer.shift_px) * np.hypot(*shift_px)
+    (issue,) = layer_issues(layer)
+    assert issue.code == "second_layer"
+
+
+def test_one_layer_is_symmetric_whatever_it_shows() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.5 * SCENE.std(), SCENE.shape)
+    nearly = cv2.warpAffine(SCENE, geometry.translation(0.3, 0.0)[:2], SCENE.shape[::-1], flags=cv2.INTER_CUBIC)
+    blurred = cv2.GaussianBlur(SCENE, (0, 0), 2.0)
+    for moving in (SCENE, SCENE + noise, nearly, blurred, np.where(ROWS, 0, SCENE), noise, np.zeros_like(SCENE)):
+        assert layer_in(moving) is None
 
 
 PERIOD = 26.0
