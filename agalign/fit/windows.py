@@ -131,7 +131,8 @@ class FixedWindows:
         total = np.zeros((1, self.side, self.side), np.complex64)
         for rows, spectra in self._spectra(structure, mask, complete[::2], self._valid_counts(mask)):
             total += whitened_cross_spectra(self.spectra[rows], spectra).sum(axis=0)
-        shift_px = np.clip(peak_positions(total * _low_pass(self.side, self.side), np.zeros((1, 2)))[0], -1, 1)
+        passed = np.asarray(total * _low_pass(self.side, self.side), np.complex64)
+        shift_px = np.clip(peak_positions(passed, np.zeros((1, 2)))[0], -1, 1)
         y, x = np.fft.fftfreq(self.side)[:, None], np.fft.fftfreq(self.side)
         to_peak = np.exp(2j * np.pi * (x * shift_px[0] + y * shift_px[1])).astype(np.complex64)
         return np.asarray(inverse_transform(total * to_peak).real[0])

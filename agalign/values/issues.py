@@ -80,11 +80,7 @@ CLOSE_WINDOWS = IssueKind(
     "close_windows", "only {value:.1%} of the windows are aligned within {detail}", remedies.PARALLAX
 )
 CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", remedies.PARALLAX)
-SECOND_LAYER = IssueKind(
-    "second_layer",
-    "about {value:.0%} of the structure fits another shift ({detail}), in parts that are smaller than the windows",
-    remedies.PARALLAX,
-)
+SECOND_LAYER = IssueKind("second_layer", "about {value:.0%} of the structure is off by {detail}", remedies.PARALLAX)
 UNEXPECTED_PX = IssueKind(
     "unexpected_px",
     "the result is {value:.1f} px from the position that the rig of the flight predicts",
