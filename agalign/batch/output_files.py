@@ -45,7 +45,7 @@ class State(Enum):
     AS_LISTED = "in a sidecar that was not edited, with this size", "write", "remove"
     WITH_MARK = "file with the mark of the program, or empty", "write", "remove"
     CHANGED = "listed with another size, without mark; other JSON where a sidecar was", "write", "keep"
-    OF_USER = "any other file, or a folder", "refuse", "keep"
+    OF_USER = "any other file", "refuse", "keep"
     INDEX = "index in the sidecar, where another output would be", "refuse", "remove"
     OTHER_RESULT = "sidecar of another capture, or of a version with another schema", "refuse", "refuse"
     IMAGE = "image of the input", "refuse", "refuse"
@@ -133,8 +133,6 @@ class _Names:
 
 def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
     """Return the state of the file of a product, given the sizes of the listed files."""
-    if path.is_dir():
-        return State.OF_USER, foreign(path)
     if not path.is_file():
         return State.NO_FILE, ""
     if path.stat().st_size == listed.get(path):

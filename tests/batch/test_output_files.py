@@ -70,11 +70,6 @@ def of_user(case: Case) -> Case:
     return Path(shutil.copy(case[1][0].reference.path, case[0])), case[1]
 
 
-def folder(case: Case) -> Case:
-    case[0].mkdir()
-    return case
-
-
 def of_user_in_an_edited_sidecar(case: Case) -> Case:
     path, captures = of_user(case)
     sidecar = read_sidecar(path.with_name("f.json"))
@@ -127,7 +122,6 @@ def too_long(case: Case) -> Case:
         (with_mark, State.WITH_MARK, "write", "remove"),
         (changed, State.CHANGED, "write", "keep"),
         (of_user, State.OF_USER, "was not written by agalign", "keep"),
-        (folder, State.OF_USER, "was not written by agalign", "keep"),
         (of_user_in_an_edited_sidecar, State.OF_USER, "was not written by agalign", "keep"),
         (index, State.INDEX, "is an index, which another output of this name", "remove"),
         (other_result, State.OTHER_RESULT, "belongs to a different capture", "belongs to a different capture"),

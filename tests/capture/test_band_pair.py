@@ -178,14 +178,16 @@ def test_files_are_worth_refining_if_their_images_lack_detail_of_the_result(
 
 @pytest.mark.parametrize("pixels", [1.0, 0.1])
 def test_a_rig_is_learned_from_errors_in_px_of_the_reference_s_file(flight: Path, pixels: float) -> None:
-    """Whatever the size of the band's pixels; the image has half the size of the file."""
+    """Whatever the size of the band's pixels; the image has half the size of the file. RMS over the image, which is less
+    than at the corners.
+    """
     pairs, _ = read_pairs(discover(flight).captures[0], SeedSettings())
     pair = replace(pairs[0], scales=PairScales(PixelScale(0.5, 0.5), SAME_PIXELS))
     joint, seed = joint_result(std_px=0.2 / 2**0.5), Seed("rig", np.eye(3), 30.0)
     mapping = pair.mapping(np.diag([pixels, pixels, 1.0]))
     alignment = Alignment(mapping, pair.fixed.size_px, (), seed, joint)
     known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
-    assert known.std_px[pair.name] == pytest.approx(0.4)
+    assert known.std_px[pair.name] == pytest.approx(0.82 * 0.4, rel=0.01)
 
 
 def test_the_error_of_a_rig_is_converted_to_px_of_the_fixed_image() -> None:
