@@ -178,8 +178,8 @@ def test_files_are_worth_refining_if_their_images_lack_detail_of_the_result(
 
 @pytest.mark.parametrize("pixels", [1.0, 0.1])
 def test_a_rig_is_learned_from_errors_in_px_of_the_reference_s_file(flight: Path, pixels: float) -> None:
-    """Whatever the size of the band's pixels; the image has half the size of the file. RMS over the image, which is less
-    than at the corners.
+    """Whatever the size of the band's pixels; the image has half the size of the file. It is the RMS over the image,
+    which is less than at the corners.
     """
     pairs, _ = read_pairs(discover(flight).captures[0], SeedSettings())
     pair = replace(pairs[0], scales=PairScales(PixelScale(0.5, 0.5), SAME_PIXELS))
