@@ -78,7 +78,7 @@ def index_tasks(
     for label, index in itertools.product((task.label for task in tasks), indices):
         other, of_other = taken.setdefault(f"{label}_{index.name}".lower(), (label, index))
         if other != label:
-            formula = next(one.name for one in (index, of_other) if one.is_of_user)
+            formula = next((one.name for one in (index, of_other) if one.is_of_user), index.name)
             what = f"{label}_{index.name}.tif: would be an index of {other} and of {label}"
             raise ConfigurationError(f"{what}; give the formula '{formula}' another name")
     if target != out and target.is_dir():

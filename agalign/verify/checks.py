@@ -158,7 +158,7 @@ def _error_issues(error: MappingError, residual: Residual, common_px: Points, pi
 
 
 class Layer(NamedTuple):
-    """Structure that fits another shift than the mapping, in parts that are smaller than the windows."""
+    """Structure that is displaced from where the mapping expects it, in parts that are smaller than the windows."""
 
     shift_px: tuple[float, float]
     """(x, y), px of the fixed image."""

@@ -571,7 +571,7 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
 
 @pytest.mark.parametrize("order", ["ABCD", "CABD", "CDAB"])
 def test_bands_with_few_windows_leave_the_parallax_to_the_others(candidates: Sequence[RefinedBand], order: str) -> None:
-    """In any order: without one of two such bands, there is no model either."""
+    """In any order. Two bands have few windows, so leaving out one of them is not enough for a model."""
     rng = np.random.default_rng(1)
     points = grid_px(np.arange(24, 620, 32), np.arange(24, 460, 32))
     parallax_px = np.where(rng.random(len(points)) < 0.3, 8.0, 0.0)[:, None]

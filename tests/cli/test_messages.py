@@ -126,6 +126,12 @@ def test_links_that_lead_back_to_themselves_are_one_line(flight: Path, tmp_path:
     assert "loop: its symbolic links lead back to themselves; give the path of a file or folder" in done.stderr
 
 
+def test_the_results_of_a_linked_folder_are_beside_the_link(flight: Path, tmp_path: Path) -> None:
+    (tmp_path / "linked").symlink_to(flight)
+    done = agalign_here("align", tmp_path / "linked", "--dry-run")
+    assert f"Into {tmp_path / 'linked-aligned'}:" in done.stderr + done.stdout
+
+
 @pytest.mark.parametrize("command", ["report", "indices", "verify"])
 def test_a_folder_of_runs_is_not_a_run(tmp_path: Path, command: str) -> None:
     """With the pages of a run in it, it would not be searched for images any more."""
