@@ -235,7 +235,7 @@ class CaptureEstimation:
         Bands that pass without it keep their errors: with it, those of flat fields would be 0.3 to 0.45 px where the
         true ones are 0.1 px.
         """
-        rejected = [band for band in self.bands.values() if band.candidates and not band.accepted]
+        rejected = [band for band in self.bands.values() if band.candidates and band.accepted is None]
         extrapolated = [band for band in rejected if is_extrapolated(band.candidates[-1])]
         if not (extrapolated and self._may_be_homography):
             return result
@@ -254,7 +254,8 @@ class CaptureEstimation:
         """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
         reduced = [band for name, band in self.bands.items() if is_worth_refining(band.pair, result[name])]
         for band in reduced:
-            refined = at_full_resolution(capture.reference, band.accepted[-1])
+            assert band.accepted is not None  # an aligned band has one
+            refined = at_full_resolution(capture.reference, band.accepted)
             if isinstance(refined, Issue):
                 band.issue, band.candidates = refined, []
             elif refined is not None:

@@ -67,10 +67,15 @@ class Candidate:
         """What the checks find; empty if it passes verification."""
         if self.given_issues is not None:
             return self.given_issues
-        issues = self._issues_by(self.residual, self.error) or self._issues_of_pixels
+        issues = self.issues_of_windows or self._issues_of_pixels
         if issues or self.other_residual is None:
             return issues
         return self._issues_by(self.other_residual, replace(self.error, residual=self.other_residual))
+
+    @cached_property
+    def issues_of_windows(self) -> tuple[Issue, ...]:
+        """What the checks without pixels find by the windows of `residual`."""
+        return self._issues_by(self.residual, self.error)
 
     def _issues_by(self, residual: Residual, error: MappingError) -> tuple[Issue, ...]:
         """What the checks without pixels find by some windows."""
@@ -81,12 +86,6 @@ class Candidate:
     def _issues_of_pixels(self) -> tuple[Issue, ...]:
         """What the checks of pixels find, which are costly."""
         return () if self.images is None else self.images.issues
-
-    @property
-    def p95_by_geometry(self) -> dict[Geometry, float]:
-        """`held_out_p95_px` with that of the candidate which it refines."""
-        earlier = {} if self.refined_from is None else self.refined_from.p95_by_geometry
-        return {**earlier, **self.held_out_p95_px}
 
     @property
     def issues_of_prediction(self) -> tuple[Issue, ...]:
@@ -210,8 +209,8 @@ class RefinedBand:
         band = self._unchanged_if_aligned
         joint, verified = band.joint, band.verified
         plane = Candidate.of(verified, joint)
-        is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not self.pair.has_rig))
-        if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
+        is_wanted = use == "always" or (use == "auto" and (not self.pair.has_rig or bool(plane.issues)))
+        if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues_of_windows):
             yield from _with_field(plane, verified, joint, is_aligned_input=use == "auto" and band is not self)
         else:
             yield plane
@@ -261,7 +260,7 @@ def _with_field(
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of(displaced, joint, displacement.held_out)
     with_field = replace(held_out, other_residual=displaced.residual, held_out_p95_px=p95_px)
-    if plane.issues or not with_field.issues:
+    if not with_field.issues or plane.issues:
         yield with_field
 
 
@@ -334,9 +333,9 @@ class BandCandidates:
         return self.issue is not None and self.issue.kind == UNREADABLE
 
     @property
-    def accepted(self) -> list[Candidate]:
-        """The candidates without issues."""
-        return [candidate for candidate in self.candidates if not candidate.issues]
+    def accepted(self) -> Candidate | None:
+        """The last candidate without issues; None without one."""
+        return next((candidate for candidate in reversed(self.candidates) if not candidate.issues), None)
 
     @property
     def rejected(self) -> tuple[Issue, ...]:

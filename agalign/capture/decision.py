@@ -101,7 +101,7 @@ class _Choice:
                 band.seed,
                 joint=band.joint,
                 residual=None if self.is_seed_refused or band.at_seed is None else band.at_seed.residual,
-                held_out_p95_px=band.candidates[-1].p95_by_geometry if band.candidates else {},
+                held_out_p95_px=band.candidates[-1].held_out_p95_px if band.candidates else {},
                 is_seed_usable=is_usable,
             )
         return Alignment(
@@ -111,7 +111,7 @@ class _Choice:
             band.seed_of(chosen),
             joint=band.joint if chosen.joint is None else chosen.joint,
             residual=chosen.residual,
-            held_out_p95_px=chosen.p95_by_geometry,
+            held_out_p95_px=chosen.held_out_p95_px,
             prediction=_prediction(chosen, self.compared) if self.issues else self.compared,
             error=chosen.error,
             std_px=chosen.std_px,
@@ -136,9 +136,9 @@ def _of_images(band: BandCandidates, relief: UnderRelief) -> _Choice:
         if not under.issues:
             return _Choice(band, under, ())
         return _Choice(band, under.with_second_layer, (Issue(OTHER_GEOMETRY), *under.issues_of_prediction))
-    if accepted := band.accepted:
+    if (accepted := band.accepted) is not None:
         is_beside = any(other.pair.reference is band.pair.reference for other in relief.values())
-        return _Choice(band, accepted[-1], (Issue(OTHER_GEOMETRY),) if is_beside else ())
+        return _Choice(band, accepted, (Issue(OTHER_GEOMETRY),) if is_beside else ())
     predicting = [candidate for candidate in band.candidates if candidate.may_predict]
     if predicting:
         best = min(predicting, key=lambda candidate: candidate.with_second_layer.std_px)

@@ -86,7 +86,16 @@ def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue |
     held_out = fitted.held_out.rescaled(scale)
     error = mapping_error(pair, down, joint.covariance_px2, held_out)
     of_field = None if down.field is None else residual_under(start.residual, start.mapping, down)
-    refined = Candidate(pair, down, error, held_out, joint, other_residual=of_field, refined_from=start)
+    refined = Candidate(
+        pair,
+        down,
+        error,
+        held_out,
+        joint,
+        other_residual=of_field,
+        held_out_p95_px=start.held_out_p95_px,
+        refined_from=start,
+    )
     return refined.with_relief_std_px(start.error.relief_std_px)
 
 

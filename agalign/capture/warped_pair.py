@@ -8,9 +8,9 @@ import numpy as np
 
 from agalign.capture.band_pair import BandPair
 from agalign.fit.held_out import chessboard, held_out
-from agalign.fit.windows import FixedWindows, residual_under
+from agalign.fit.windows import FixedWindows, centred_correlation, residual_under
 from agalign.pixels.band_resampling import shrink
-from agalign.pixels.structure import structure_field, windowed_spectra
+from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
@@ -40,6 +40,8 @@ class WarpedPair:
     windows: FixedWindows
     residual: Residual
     """Of these windows, under the mapping or, if it is cross-validated, under the estimates without each of them."""
+    cross: Field | None = None
+    """Sum of cross spectra of these windows under the warped image; None if they were not correlated here."""
 
     @classmethod
     def of(cls, pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> "WarpedPair":
@@ -48,10 +50,10 @@ class WarpedPair:
         By default these are those of the pair, or small ones if these are measured in more quarters of the overlap. A
         fit and its verification must use the same windows: those of two grids share pixels, whatever their colours.
         """
-        warped = pair.warped_moving(mapping)
         if windows is not None:
-            return cls(pair, mapping, warped, windows, windows.residuals(warped))
-        usual, size_px = cls(pair, mapping, warped, pair.windows, pair.windows.residuals(warped)), pair.fixed.size_px
+            warped = pair.warped_moving(mapping)
+            return cls(pair, mapping, warped, windows, *windows.correlated(warped))
+        usual, size_px = cls.of(pair, mapping, pair.windows), pair.fixed.size_px
         in_frame_px = points_in_frame(mapping, *pair.sizes_px)
 
         def unobserved(one: WarpedPair) -> int:
@@ -60,7 +62,7 @@ class WarpedPair:
         if not unobserved(usual):
             return usual
         small = pair.reference.small_windows
-        smaller = replace(usual, windows=small, residual=small.residuals(warped))
+        smaller = replace(usual, windows=small, residual=small.residuals(usual.warped), cross=None)
         return min((usual, smaller), key=unobserved)
 
     def with_mapping(self, mapping: PixelMapping) -> "WarpedPair":
@@ -99,15 +101,21 @@ class WarpedPair:
         return alias_peaks(reference.seed_spectrum, moving, reference.seed_scale)
 
     @cached_property
+    def _in_usual_windows(self) -> tuple[Residual, Field]:
+        """The residual and the sum of cross spectra of the windows that cover the image once."""
+        if self.windows is self.pair.windows and self.cross is not None:
+            return self.residual, self.cross
+        return self.pair.windows.correlated(self.warped)
+
+    @cached_property
     def second_layer(self) -> Layer | None:
         """Structure of the moving image that fits another shift."""
-        return second_layer(self.pair.windows.mean_correlation(self.warped))
+        return second_layer(centred_correlation(self._in_usual_windows[1]))
 
     @cached_property
     def issues(self) -> tuple[Issue, ...]:
         """What the checks of the pixels find."""
-        usual = self.pair.windows  # they cover the image once
-        residual = self.residual if self.windows is usual else usual.residuals(self.warped)
+        residual, _ = self._in_usual_windows
         is_expected = partial(self.pair.is_expected, self.mapping.fixed_to_moving)
         return (
             *content_issues(residual, self.pair.file_pixel_size_px),

@@ -103,7 +103,12 @@ class FixedWindows:
         return cls(valid, structure, side_px, origins=origins, min_valid_share=min_valid_share)
 
     def residuals(self, moving: Raster) -> Residual:
-        """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
+        """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak."""
+        return self.correlated(moving)[0]
+
+    def correlated(self, moving: Raster) -> tuple[Residual, Field]:
+        """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak. Also
+        return the sum (1, side, side) of the cross spectra of every second window without invalid pixels.
 
         A window is measured by the pixels that are valid in both images; the fewer these are, the lower is the peak,
         and with it the weight of the shift. Windows with too few are omitted.
@@ -111,31 +116,19 @@ class FixedWindows:
         mask, structure = _inside(moving.valid), structure_field(moving)
         share, counts = self._valid_counts(self.valid & mask) / self.side**2, self._valid_counts(mask)
         with_pixels, parts = np.flatnonzero(share >= self.min_valid), []
+        is_complete, is_summed = share >= 1 - _MAX_IGNORED_SHARE, np.zeros(len(share), dtype=bool)
+        is_summed[np.flatnonzero(is_complete)[::2]] = True
+        total = np.zeros((1, self.side, self.side), np.complex64)
         for rows, spectra in self._spectra(structure, mask, with_pixels, counts):
             cross = whitened_cross_spectra(self.spectra[rows], spectra)
-            masked = share[rows] < 1 - _MAX_IGNORED_SHARE
+            total += cross[is_summed[rows]].sum(axis=0)
+            masked = ~is_complete[rows]
             if masked.any():
                 fixed, other = (self._cut(valid, self.origins[rows[masked]]) for valid in (self.valid, mask))
                 cross[masked] = _relative_to_overlap(cross[masked], fixed, other)
             parts.append((rows, *_peaks(cross)))
         rows, shifts_px, sigma = map(np.concatenate, zip(*parts, strict=True))
-        return Residual(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
-
-    def mean_correlation(self, moving: Raster) -> NDArray[np.float32]:
-        """Return the mean of the correlation surfaces (side, side) of every second window without invalid pixels in a
-        moving band on the reference grid; [dy, dx] is the shift from the peak next to zero. It is 0 without such
-        windows.
-        """
-        mask, structure = _inside(moving.valid), structure_field(moving)
-        complete = np.flatnonzero(self._valid_counts(self.valid & mask) >= (1 - _MAX_IGNORED_SHARE) * self.side**2)
-        total = np.zeros((1, self.side, self.side), np.complex64)
-        for rows, spectra in self._spectra(structure, mask, complete[::2], self._valid_counts(mask)):
-            total += whitened_cross_spectra(self.spectra[rows], spectra).sum(axis=0)
-        passed = np.asarray(total * _low_pass(self.side, self.side), np.complex64)
-        shift_px = np.clip(peak_positions(passed, np.zeros((1, 2)))[0], -1, 1)
-        y, x = np.fft.fftfreq(self.side)[:, None], np.fft.fftfreq(self.side)
-        to_peak = np.exp(2j * np.pi * (x * shift_px[0] + y * shift_px[1])).astype(np.complex64)
-        return np.asarray(inverse_transform(total * to_peak).real[0])
+        return Residual(self.centres_px[rows], shifts_px, sigma, self.cells[rows]), total
 
     def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
         """Return (n, side, side) the windows with these origins, a copy."""
@@ -204,6 +197,18 @@ def _relative_to_overlap(cross: Field, fixed: Mask, moving: Mask) -> Field:
     min_share = 0.5  # of that at zero shift: smaller overlaps would amplify noise
     surfaces = inverse_transform(cross).real * (at_zero / np.maximum(share, min_share * at_zero))
     return forward_transform(surfaces.astype(np.complex64))
+
+
+def centred_correlation(cross: Field) -> NDArray[np.float32]:
+    """Return the correlation surface (side, side) of a cross spectrum (1, side, side); [dy, dx] is the shift from the
+    peak next to zero.
+    """
+    side = cross.shape[-1]
+    passed = np.asarray(cross * _low_pass(side, side), np.complex64)
+    shift_px = np.clip(peak_positions(passed, np.zeros((1, 2)))[0], -1, 1)
+    y, x = np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side)
+    to_peak = np.exp(2j * np.pi * (x * shift_px[0] + y * shift_px[1])).astype(np.complex64)
+    return np.asarray(inverse_transform(cross * to_peak).real[0])
 
 
 class Shifts(NamedTuple):

@@ -224,8 +224,6 @@ def test_the_p95_of_an_estimate_that_is_not_chosen_is_not_recorded() -> None:
     first = candidate(shift_px=1.5, held_out_p95_px={"homography": 2.0, "field": 1.8})
     chosen = candidate(held_out_p95_px={"homography": 0.4})
     assert decided(pair(), SEED, [first, chosen]).held_out_p95_px == {"homography": 0.4}
-    on_tiles = candidate(refined_from=chosen)
-    assert decided(pair(), SEED, [first, on_tiles]).held_out_p95_px == {"homography": 0.4}
     assert against(rig_prediction(), first).held_out_p95_px == {}
     untried = unconfirmed(held_out_p95_px={"homography": 2.0})
     assert decided(pair(), SEED, [untried, unconfirmed()]).held_out_p95_px == {}

@@ -30,6 +30,7 @@ from agalign.pixels.raster import open_raster
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
+from agalign.values.choices import Geometry
 from agalign.values.geometry import PairScales
 from agalign.values.image import Tile
 from agalign.values.mapping import DisplacementField, PixelMapping
@@ -147,10 +148,14 @@ def test_the_displacement_field_of_the_reduced_images_continues_by_chance_far_fr
     start = on_reduced_images(pair)
     nodes = np.zeros((9, 11, 2))
     nodes[..., 0] = 0.5 * np.sin(np.arange(11))
-    bent = replace(start, mapping=replace(start.mapping, field=DisplacementField(50.0, nodes)))
-    error = refined(capture, bent).error
+    p95_px: dict[Geometry, float] = {"homography": 0.9, "field": 0.4}
+    field = DisplacementField(50.0, nodes)
+    bent = replace(start, mapping=replace(start.mapping, field=field), held_out_p95_px=p95_px)
+    result = refined(capture, bent)
+    error = result.error
     assert error.field_std_px == pytest.approx(0.35, abs=0.05)  # 0.5 / sqrt(2)
     assert error.lens_std_px is None
+    assert result.held_out_p95_px == p95_px
 
 
 @pytest.mark.parametrize(

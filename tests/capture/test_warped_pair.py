@@ -7,6 +7,7 @@ import pytest
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.warped_pair import WarpedPair
+from agalign.pixels.structure import Field
 from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.values.residual import Residual
@@ -63,15 +64,15 @@ def test_smaller_windows_are_measured_where_valid_areas_are_small() -> None:
 def test_smaller_windows_are_used_where_larger_ones_have_no_peak(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter without a measured shift is not observed, whatever its texture."""
     pair = pair_of(*two_views(np.eye(3), 640, 480))
-    measured = pair.windows.residuals
+    correlated = pair.windows.correlated
 
-    def without_a_quarter(moving: Raster) -> Residual:
-        residual = measured(moving)
+    def without_a_quarter(moving: Raster) -> tuple[Residual, Field]:
+        residual, cross = correlated(moving)
         is_lost = (residual.centres_px < (320, 240)).all(axis=1)
-        return residual.with_shifts(np.where(is_lost[:, None], np.nan, residual.shifts_px))
+        return residual.with_shifts(np.where(is_lost[:, None], np.nan, residual.shifts_px)), cross
 
     assert WarpedPair.of(pair, pair.mapping(np.eye(3))).windows is pair.windows
-    monkeypatch.setattr(pair.windows, "residuals", without_a_quarter)
+    monkeypatch.setattr(pair.windows, "correlated", without_a_quarter)
     assert WarpedPair.of(pair, pair.mapping(np.eye(3))).windows is pair.reference.small_windows
 
 

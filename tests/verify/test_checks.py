@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.fit.windows import FixedWindows
+from agalign.fit.windows import FixedWindows, centred_correlation
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry, issues
 from agalign.values.alignment import JointResult, Prediction
@@ -346,7 +346,7 @@ def test_a_scene_that_repeats_across_a_third_of_the_image_is_repetitive() -> Non
 def layer_in(moving: np.ndarray) -> Layer | None:
     """The second layer of a moving image of SCENE."""
     windows = FixedWindows(np.ones(SCENE.shape, bool), structure_field(whole(SCENE)))
-    return second_layer(windows.mean_correlation(whole(np.float32(moving))))
+    return second_layer(centred_correlation(windows.correlated(whole(np.float32(moving)))[1]))
 
 
 SCENE = textured_image(480, 360, 4).astype(np.float32)
