@@ -42,6 +42,7 @@ from agalign.values.alignment import BY_WINDOWS, JointResult
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.issues import PREDICTED_WITH
+from agalign.values.lens_shapes import CORNERS
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual, decrease_in_standard_errors, lengths_in_common_px
@@ -228,7 +229,7 @@ class _Band:
         """The result with the homography of the plane, which is fitted to windows and verified with others."""
         assert self.covariance_px2 is not None
         joint = replace(self.refined.joint, recipe=BY_WINDOWS)
-        return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2[:8, :8])
+        return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2[:CORNERS, :CORNERS])
 
     @cached_property
     def by_homography(self) -> Residual:

@@ -17,6 +17,7 @@ from agalign.values.choices import Geometry, ReliefUse, SeedKind
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import BY_PARALLAX, OTHER_GEOMETRY, PREDICTED_WITH, SEED_ASKED_FOR, UNREADABLE, Issue
+from agalign.values.lens_shapes import CORNERS
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual, decrease_in_standard_errors
@@ -159,7 +160,7 @@ def mapping_error(
         pair.fixed.size_px,
         covariance_px2,
         residual,
-        lens_std_px=pair.unknown_lens_std_px if len(covariance_px2) == 8 else None,
+        lens_std_px=pair.unknown_lens_std_px if len(covariance_px2) == CORNERS else None,
         field_std_px=spread_px,
         relief_std_px=0.0 if mapping.parallax is not None else pair.relief_std_px,
         parallax=mapping.parallax,

@@ -30,6 +30,7 @@ from agalign.values.alignment import JointResult
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.least_squares import Robust, least_squares
+from agalign.values.lens_shapes import CORNERS
 from agalign.values.residual import Residual
 
 _MAX_CORRECTION_PX = 4.0
@@ -94,7 +95,7 @@ def _with_windows(pair: BandPair, result: JointResult, fit: WindowFit) -> JointR
     of_windows, covariance = np.linalg.inv(fit.covariance_px2), fit.covariance_px2
     if (known := result.corner_covariance_px2) is not None:
         chi2 = float(fit.corners_px @ np.linalg.solve(known + fit.covariance_px2, fit.corners_px))
-        covariance = np.linalg.inv(np.linalg.inv(known * max(1.0, chi2 / 8)) + of_windows)
+        covariance = np.linalg.inv(np.linalg.inv(known * max(1.0, chi2 / CORNERS)) + of_windows)
     return _displaced(pair, result, covariance @ of_windows @ fit.corners_px, covariance)
 
 
@@ -109,12 +110,14 @@ def _with_prior(pair: BandPair, result: JointResult, prior: RigPrediction) -> Jo
     delta_px = (geometry.apply(to_fixed, expected) - corners).ravel()
     std_px = prior.std_px(result.fixed_to_moving)
     over = geometry.over_corners(lattice(size_px)[0], *size_px)
-    information = 8 / std_px**2 * np.einsum("nki,nkj->ij", over, over) / len(over)
+    information = CORNERS / std_px**2 * np.einsum("nki,nkj->ij", over, over) / len(over)
     whitening = np.linalg.cholesky(information).T
     degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
     robust = Robust(degrees_of_freedom**0.5, iterations=20)
     first_weight = np.ones(1)  # that of a residual of 0 would start at the rig and may stay there
-    weight = (1 + 8 / degrees_of_freedom) * first_weight  # of a multivariate t distribution: (nu + 8) / (nu + r^2)
+    weight = (
+        1 + CORNERS / degrees_of_freedom
+    ) * first_weight  # of a multivariate t distribution: (nu + 8) / (nu + r^2)
     of_images = np.asarray(np.linalg.inv(result.corner_covariance_px2), np.float64)
     of_rig = whitening[None], (whitening @ delta_px)[None], weight
     estimate = least_squares(*of_rig, of_images, robust=robust, first_weights=first_weight)

@@ -36,9 +36,7 @@ def _with_moved_areas(alignment: Alignment, pair: BandPair, warped: Raster) -> A
         return alignment
     both = pair.reference.grey.valid & warped.valid
     whole = replace(warped, valid=np.ones_like(warped.valid))  # a third faster; invalid pixels are not used
-    areas = moved_areas(pair.reference.structure, structure_field(whole), both)
-    in_file_px = [area.rescaled(pair.scales.fixed.inverse) for area in areas]
-    # Shifts of the size of those elsewhere are errors of the mapping. The expected error contains windows in the areas.
-    min_ratio = 4.0
-    moved = tuple(area for area in in_file_px if area.length_px >= min_ratio * alignment.residual.median_px)
+    median_px = alignment.residual.median_px * pair.scales.fixed.mean
+    areas = moved_areas(pair.reference.structure, structure_field(whole), both, median_px)
+    moved = tuple(area.rescaled(pair.scales.fixed.inverse) for area in areas)
     return replace(alignment, error=replace(alignment.error, moved=moved)) if moved else alignment

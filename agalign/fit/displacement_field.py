@@ -3,11 +3,9 @@
 A field is accepted if the p95 of windows that were left out of the fit hardly grows, and the image does not fold.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +21,7 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.least_squares import cauchy_weights, mean_in_standard_errors, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.residual import Residual, noise_px
+from agalign.values.residual import Residual, peak_weights
 
 _FIELD_WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
@@ -34,9 +32,8 @@ _CAUCHY_SCALES = 4.0
 """Residual at which the robust weight is one half, in residual scales: only wrong peaks have larger ones."""
 MIN_WINDOWS = 24
 """Minimum number of windows with a shift for a field or a relief; a fit without one fold may have half as many."""
-_NOISE_PX, _MAX_WEIGHT = 0.12, 4.0
-"""Noise of a window with weight 1: half of the windows of sharp images have less. The parts with most texture do not
-determine the field of the others."""
+_NOISE_PX = 0.12
+"""Noise of a window with weight 1: half of the windows of sharp images have less."""
 _SMOOTHNESS = 0.4
 """Weight of the second differences of a field, relative to such a window: their prior has a standard deviation of
 _NOISE_PX / sqrt(_SMOOTHNESS) = 0.19 px. With 2, errors at ties are a sixth larger on three scenes."""
@@ -104,7 +101,7 @@ class DisplacementEstimator:
         """Measure the windows; their weights are relative to one with a noise of _NOISE_PX."""
         residual = self.windows.residuals(warped(moving, mapping, self.size_px))
         peaks_sigma = residual.peaks_sigma[residual.is_measured]
-        return Shifts.of(residual)._replace(weights=np.minimum((_NOISE_PX / noise_px(peaks_sigma)) ** 2, _MAX_WEIGHT))
+        return Shifts.of(residual)._replace(weights=peak_weights(peaks_sigma, _NOISE_PX))
 
     def _held_out(
         self,
@@ -141,37 +138,6 @@ class DisplacementEstimator:
         return fitted_field(shifts.subset(apart), _SMOOTHNESS, self.lattice_px, self.size_px, reweightings)
 
 
-class _Gain(NamedTuple):
-    """Decrease of the residuals of held-out windows by a field."""
-
-    smoothness: float
-    before_p95_px: float = math.nan
-    after_p95_px: float = math.nan
-    loss: float = math.inf
-    """Mean of `_losses` of the remaining shifts, weighted."""
-    sigma: float = 0.0
-    """Mean decrease of that loss, without weights, in standard errors."""
-
-    @classmethod
-    def of(cls, shifts: Shifts, predicted_px: Points, smoothness: float) -> "_Gain":
-        """Return the gain from predictions (n, 2) of the shifts, NaN for windows that were not held out."""
-        min_weight = 0.1  # relative; parallax within a window lowers its peak
-        compared = shifts.weights >= min_weight
-        compared &= np.isfinite(predicted_px[:, 0])
-        if not compared.any():
-            return cls(smoothness)
-        shifts = shifts.subset(compared)
-        before_px, after_px = shifts.distances_px(), shifts.distances_px(predicted_px[compared])
-        before_p95_px, after_p95_px = (float(np.percentile(v, 95)) for v in (before_px, after_px))
-        losses = _losses(after_px)
-        loss = float(np.average(losses, weights=shifts.weights))
-        return cls(smoothness, before_p95_px, after_p95_px, loss, mean_in_standard_errors(_losses(before_px) - losses))
-
-    def is_significant(self, min_sigma: float) -> bool:
-        """Return True if a field reduces the shifts significantly without a larger p95."""
-        return self.sigma >= min_sigma and self.after_p95_px <= _MAX_P95_GROWTH * self.before_p95_px
-
-
 def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
     scale_px = 0.1  # several times the noise of a shift
@@ -194,21 +160,32 @@ def common_field(residuals: Sequence[Residual], size_px: tuple[int, int]) -> Dis
     def fitted(some: Sequence[Shifts], smoothness: float) -> DisplacementField:
         return fitted_field(Shifts.joined(some), smoothness * len(some), NODE_STEP_PX, size_px)
 
-    def gain(smoothness: float) -> _Gain:
+    def held_out_px(smoothness: float) -> Points:
         predicted_px = []
         for fold in folds:
             field = fitted([c for other in folds if other is not fold for c in other], smoothness)
             predicted_px += [field(c.centres_px) for c in fold]
-        return _Gain.of(Shifts.joined(every), np.concatenate(predicted_px), smoothness)
+        return compared.shifts_px - np.concatenate(predicted_px)[is_compared]
 
+    joined, min_weight = Shifts.joined(every), 0.1  # parallax within a window lowers its peak
+    is_compared = joined.weights >= min_weight
+    compared = joined.subset(is_compared)
     candidates = 1.0, 4.0, 16.0, 64.0  # relative to one window of each capture
-    best = min(map(gain, candidates), key=lambda g: g.loss)
-    # Less than within one capture, as captures that are left out have only their lenses in common with the others.
-    min_gain_sigma = 2.5
-    if not best.is_significant(min_gain_sigma):
+    lengths_px = {smoothness: np.linalg.norm(held_out_px(smoothness), axis=1) for smoothness in candidates}
+    best = min(candidates, key=lambda smoothness: np.average(_losses(lengths_px[smoothness]), weights=compared.weights))
+    if not _are_decreased(compared.distances_px(), lengths_px[best]):
         return None
-    field = fitted(every, best.smoothness)
+    field = fitted(every, best)
     return field if _is_one_to_one(field, size_px) else None
+
+
+def _are_decreased(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -> bool:
+    """Return True if the lengths (n,) of shifts decrease significantly, and their p95 hardly grows."""
+    # Less than within one capture, as captures that are left out have only their lenses in common with the others.
+    min_decrease = 2.5  # standard errors
+    before_p95_px, after_p95_px = (np.percentile(lengths_px, 95) for lengths_px in (before_px, after_px))
+    decrease = mean_in_standard_errors(_losses(before_px) - _losses(after_px))
+    return bool(decrease >= min_decrease and after_p95_px <= _MAX_P95_GROWTH * before_p95_px)
 
 
 def fitted_field(

@@ -31,15 +31,15 @@ from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
 from agalign.fit.held_out import Folds, held_out, remaining
-from agalign.fit.windows import Shifts, peak_weights
+from agalign.fit.windows import Shifts
 from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
-from agalign.values.lens_shapes import jacobian, lens_shapes, shift_variance_px2
+from agalign.values.lens_shapes import CORNERS, jacobian, lens_shapes, shift_variance_px2
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, peak_weights
 
 Array = NDArray[np.float64]
 
@@ -134,9 +134,9 @@ def fit_windows(
     if lens_std_px is None and len(raw.centres_px) < _MIN_FITTED_WINDOWS:
         return None
     points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
-    shifts_px, std_px, with_shapes = shifted_px - points_px, np.full(8, np.inf), lens_std_px is not None
+    shifts_px, std_px, with_shapes = shifted_px - points_px, np.full(CORNERS, np.inf), lens_std_px is not None
     if lens_std_px is not None:
-        std_px = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px]
+        std_px = np.r_[np.full(CORNERS, _CORNER_STD_PX), lens_std_px]
     count = len(std_px)
     design = jacobian(points_px, size_px, count)
     mean = np.zeros(count)
@@ -156,7 +156,7 @@ def fit_windows(
 
 def _window_fit(mean: Array, residuals_px: Array, size_px: tuple[int, int], covariance: Array, count: int) -> WindowFit:
     """Split parameters and their covariance into corners and lens shapes, `count` together, and baseline."""
-    corners_px, lens_px, baseline = np.split(mean, [8, count])
+    corners_px, lens_px, baseline = np.split(mean, [CORNERS, count])
     lens, t = (None if not len(part) else part for part in (lens_px, baseline))
     covariance_px2 = covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     baseline_std = math.sqrt(np.trace(covariance[count:, count:]))
@@ -358,7 +358,7 @@ def adjust(
     if initial is None or not np.linalg.norm(initial, axis=1).max() > 0:
         return None
     baselines = initial / np.linalg.norm(initial, axis=1).max()
-    smooth_std_px = np.r_[np.full(8, _CORNER_STD_PX), [] if lens_std_px is None else lens_std_px]
+    smooth_std_px = np.r_[np.full(CORNERS, _CORNER_STD_PX), [] if lens_std_px is None else lens_std_px]
     count = len(smooth_std_px)
     design = jacobian(windows.points_px, size_px, count)
     prior = np.diag(np.r_[smooth_std_px, [BaselinePrior().std] * 2] ** -2)

@@ -22,7 +22,7 @@ from agalign.pixels.structure import (
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, peak_weights
 
 _Element = TypeVar("_Element", bound=np.generic)
 
@@ -236,16 +236,6 @@ class Shifts(NamedTuple):
     def distances_px(self, predicted_px: Points | float = 0.0) -> NDArray[np.float64]:
         """Return (n,) the lengths of the shifts, minus predicted ones (n, 2)."""
         return np.asarray(np.linalg.norm(self.shifts_px - predicted_px, axis=1))
-
-
-def peak_weights(peaks_sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the relative weights of shifts from the heights (n,) of their correlation peaks; 0 for a height of 0.
-
-    The errors of shifts are inversely proportional to the squared peaks. The weight of a median peak is 1; it is
-    limited, so that the parts with most texture do not determine the geometry of the others.
-    """
-    positive, max_weight = peaks_sigma[peaks_sigma > 0], 4.0
-    return np.minimum((peaks_sigma / np.median(positive)) ** 4, max_weight) if positive.size else peaks_sigma
 
 
 def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.flight import rig
-from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, capture_factors, design_tensor
+from agalign.flight.rig import (
+    MIN_CAPTURES,
+    NU,
+    CaptureFactors,
+    Factor,
+    Observation,
+    Rig,
+    capture_factors,
+    design_tensor,
+)
 from agalign.values.least_squares import least_squares
 
 Array = NDArray[np.float64]
@@ -137,7 +146,7 @@ class _Table:
             # The median is robust to a few captures at another height.
             result -= np.median(result[is_used > 0], axis=0)
             # Errors of the baselines displace captures far from the median factors.
-            displaced_px2 = layout_std**2 * (result[:, :3] ** 2).sum(axis=1, keepdims=True)
+            displaced_px2 = layout_std**2 * (result[:, NU] ** 2).sum(axis=1, keepdims=True)
             weights_of_bands = (weights / (1 + weights * displaced_px2)).T
             design = np.concatenate([of_offset, np.moveaxis(tensor @ result.T, (3, 0), (0, 3))], axis=3)
             # Parameters that neither the layout nor the factors determine keep their values.
@@ -148,7 +157,7 @@ class _Table:
             previous, bands = bands, np.hstack([estimate[:, :6], _normalised(estimate[:, 6:], factors)])
             if np.abs(bands - previous).max() < max_change:
                 break
-        information = weights.T @ (result[:, :3] ** 2).sum(axis=1) + 1 / t_std**2
+        information = weights.T @ (result[:, NU] ** 2).sum(axis=1) + 1 / t_std**2
         return bands, np.minimum(1 / np.sqrt(information), 1.0), result
 
     def cross_validated_px(self, factors: Sequence[Factor]) -> Array:

@@ -37,6 +37,14 @@ Factor = Literal["distance", "tilt", "motion", "reference"]
 
 FACTORS = 5
 """Number of elements of nu and w together."""
+NU, W = slice(0, 3), slice(3, 5)
+"""Their elements among the factors of a capture."""
+_COLUMNS: Mapping[Factor, tuple[int, ...]] = {
+    "distance": (0,),
+    "tilt": (1, 2),
+    "motion": (3, 4),
+    "reference": (3, 4),  # a motion of all moving bands relative to the reference
+}
 MIN_CAPTURES = 3
 """Fewer captures agree by chance too often."""
 FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
@@ -135,11 +143,9 @@ def has_delays(factors: Sequence[Factor]) -> bool:
 def design_tensor(factors: Sequence[Factor]) -> Array:
     """Return (3, 2, 3, 5) the bilinear model: coefficients of (t_x, t_y, d) times the factors (5,), 0 if not used."""
     result = np.zeros((3, 2, 3, FACTORS))
-    result[0, 0, range(3), range(3)] = result[1, 1, range(3), range(3)] = 1.0
-    result[2, (0, 1), 0, (3, 4)] = 1.0
-    # `reference` is a motion of all moving bands relative to the reference.
-    columns: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
-    return result * np.isin(range(FACTORS), [column for factor in factors for column in columns[factor]])
+    result[0, 0, :, NU] = result[1, 1, :, NU] = np.eye(3)
+    result[2, :, 0, W] = np.eye(2)
+    return result * np.isin(range(FACTORS), [column for factor in factors for column in _COLUMNS[factor]])
 
 
 def capture_factors(design: Array, differences: Array, weights: Array) -> Estimate:

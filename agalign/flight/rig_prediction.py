@@ -13,6 +13,7 @@ from agalign.flight.rig import (
     FACTORS,
     MIN_CAPTURES,
     MIN_STD_PX,
+    NU,
     CaptureFactors,
     Observation,
     Rig,
@@ -129,8 +130,8 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> tuple[Matrix, Predic
     residuals_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2))
     is_known = weights[0] > 0
     excess_px2 = (residuals_px2 - expected_px**2)[is_known] - np.square(std_px)[is_known]
-    learned_px2 = [np.square(c.factors[:3]).sum() for c in rig.captures]
-    outside_px2 = np.square(solutions[0, :3]).sum() - np.mean(learned_px2 or [0.0])
+    learned_px2 = [np.square(c.factors[NU]).sum() for c in rig.captures]
+    outside_px2 = np.square(solutions[0, NU]).sum() - np.mean(learned_px2 or [0.0])
     of_factors_px2 = np.einsum("akf,fg,akg->", design, covariance - if_all_known, design)
     baseline_px2 = 2 * rig.baseline_std[band] ** 2 * outside_px2
     variances_px2 = (np.median(excess_px2), of_factors_px2, baseline_px2)
@@ -184,7 +185,7 @@ def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[
     # Captures of similar speed do not determine the slope: `rcond` selects the solution of minimum norm.
     scale = np.abs(x).max(axis=0) + 1e-12
     slope = np.linalg.lstsq(x / scale, np.array([c.factors for c in known]), rcond=1e-3)[0]
-    slope = slope * [0, 0, 0, 1, 1]  # only w depends on the motion
+    slope[:, NU] = 0  # only w depends on the motion
     change = (np.array([1.0, *motion]) - x) / scale @ slope
     moved = [replace(c, factors=tuple(np.add(c.factors, d).tolist())) for c, d in zip(known, change, strict=True)]
     return moved, np.array([1.0, *motion]) / scale @ slope

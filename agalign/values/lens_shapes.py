@@ -15,6 +15,9 @@ from agalign.values.least_squares import MIN_SHIFT_SCALE_PX
 
 Array = NDArray[np.float64]
 
+CORNERS = 8
+"""Coordinates of the corners, x and y in turn, clockwise from the top left: the parameters of a homography. Those of
+the lens shapes follow them in a covariance."""
 LENS_STD = (1.3e-3, 0.7e-3, 1.2e-3, 1.2e-3)
 """Standard deviation of each shape at the corners, as a share of half the diagonal. The lenses of 28 band pairs of six
 cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tags) differ by 1.0, 0.6, 1.0 and 1.0 px
@@ -46,10 +49,12 @@ def lens_std_px(size_px: tuple[int, int], *, calibrated: bool) -> Array:
     return np.array(LENS_STD) * float(np.hypot(*size_px)) / 2 * (CALIBRATED if calibrated else 1.0)
 
 
-def jacobian(points_px: Points, size_px: tuple[int, int], parameters: int = 12) -> Array:
+def jacobian(points_px: Points, size_px: tuple[int, int], parameters: int) -> Array:
     """Return (n, 2, 8 or 12) the derivative of displacements of points by those of the corners, and by lens shapes."""
     of_corners = geometry.over_corners(points_px, *size_px)
-    return of_corners if parameters == 8 else np.concatenate([of_corners, lens_shapes(points_px, size_px)], axis=2)
+    if parameters == CORNERS:
+        return of_corners
+    return np.concatenate([of_corners, lens_shapes(points_px, size_px)], axis=2)
 
 
 def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, int]) -> Array:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from agalign.values import geometry
 from agalign.values.geometry import PairScales, Points
 from agalign.values.image import FloatImage, Tile
-from agalign.values.lens_shapes import lens_shapes, variance_of_shapes_px2, variance_px2
+from agalign.values.lens_shapes import CORNERS, lens_shapes, variance_of_shapes_px2, variance_px2
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
@@ -206,20 +206,18 @@ class MappingError:
         if self.covariance_px2 is None or self.lens_std_px is None or self._measured is None:
             return self.covariance_px2
         centres_px = self._measured.centres_px
-        flat_corners = geometry.over_corners(centres_px, *self.size_px).reshape(-1, 8)
-        flat_lenses = lens_shapes(centres_px, self.size_px).reshape(-1, 4)
-        damping = 1e-9 * np.trace(flat_corners.T @ flat_corners) * np.eye(8)
+        flat_corners = geometry.over_corners(centres_px, *self.size_px).reshape(-1, CORNERS)
+        flat_lenses = lens_shapes(centres_px, self.size_px).reshape(len(flat_corners), -1)
+        damping = 1e-9 * np.trace(flat_corners.T @ flat_corners) * np.eye(CORNERS)
         followed = np.linalg.solve(flat_corners.T @ flat_corners + damping, flat_corners.T @ flat_lenses)
         remaining = flat_lenses - flat_corners @ followed
         # By the shifts beyond their noise: with all of the shift, bands with noise or saturation claim up to twice as
         # much, although seven tenths of the errors are within the claims without it.
         information = remaining.T @ remaining / variance_of_shapes_px2(self._measured.std_px**2 / 2)
         of_lenses = np.linalg.inv(np.diag(self.lens_std_px**-2.0) + information)
-        result = np.zeros((12, 12))
-        result[:8, :8] = self.covariance_px2[:8, :8] + followed @ of_lenses @ followed.T
-        result[:8, 8:] = -followed @ of_lenses
-        result[8:, :8], result[8:, 8:] = result[:8, 8:].T, of_lenses
-        return result
+        of_corners = self.covariance_px2[:CORNERS, :CORNERS] + followed @ of_lenses @ followed.T
+        of_both = -followed @ of_lenses
+        return np.block([[of_corners, of_both], [of_both.T, of_lenses]])
 
     def _unmodelled_px2(self, points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return u^2 (n,): the expected squared shift at points that the mapping does not contain.

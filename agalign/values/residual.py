@@ -31,9 +31,27 @@ is up to five times that at tie points. With 1/150, a blurred band passes whose 
 tie points: low peaks of blurred images are not noise alone."""
 
 
+_MAX_WEIGHT = 4.0
+"""Of a shift in a fit: the parts with most texture do not determine the geometry of the others."""
+
+
 def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
     """Return the RMS noise (n,) of the length of measured shifts from the heights (n,) of their correlation peaks."""
-    return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
+    with np.errstate(divide="ignore"):  # a height of 0 has infinite noise
+        return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
+
+
+def peak_weights(peaks_sigma: NDArray[np.float64], noise_of_1_px: float | None = None) -> NDArray[np.float64]:
+    """Return the weights of shifts in a fit from the heights of their correlation peaks, of the same shape; 0 for a
+    height of 0.
+
+    They are inversely proportional to the variances, and 1 for a noise of `noise_of_1_px`, by default that of the
+    median peak; the largest is _MAX_WEIGHT.
+    """
+    if noise_of_1_px is None:
+        positive = peaks_sigma[peaks_sigma > 0]
+        noise_of_1_px = float(noise_px(np.median(positive))) if positive.size else 1.0
+    return np.minimum(np.square(noise_of_1_px / noise_px(peaks_sigma)), _MAX_WEIGHT)
 
 
 @validated.dataclass(frozen=True, config=RECORD)

@@ -56,6 +56,9 @@ _SAME_PX = 2
 """Shifts of windows that differ by up to this are the same: they are measured at every second pixel."""
 MIN_MOVED_PX = 1.5
 """Shifts below it are errors of mapping and noise, which the expected error describes."""
+_MIN_RATIO = 4.0
+"""Minimum ratio of the shift of an area to those of the windows elsewhere, which are errors of the mapping too: the
+expected error contains windows in the areas."""
 
 
 class _Windows(NamedTuple):
@@ -115,7 +118,7 @@ class _Pair:
         )
 
 
-def moved_areas(fixed: Field, moving: Field, valid: Mask) -> tuple[MovedArea, ...]:
+def moved_areas(fixed: Field, moving: Field, valid: Mask, median_px: float = 0.0) -> tuple[MovedArea, ...]:
     """Return the areas in which two images agree under another shift, and contradict the mapping between them.
 
     Parameters
@@ -125,6 +128,8 @@ def moved_areas(fixed: Field, moving: Field, valid: Mask) -> tuple[MovedArea, ..
         pixels may have any value.
     valid
         (height, width): True where both images have pixels that are not saturated.
+    median_px
+        Median shift of the windows under the mapping, px of the fixed image.
 
     Returns
     -------
@@ -134,7 +139,8 @@ def moved_areas(fixed: Field, moving: Field, valid: Mask) -> tuple[MovedArea, ..
     pair = _Pair.of(fixed, moving, valid)
     if pair is None:
         return ()
-    return tuple(area for group in _groups(_found(pair, _candidates(pair))) for area in _areas(pair, group))
+    areas = (area for group in _groups(_found(pair, _candidates(pair))) for area in _areas(pair, group))
+    return tuple(area for area in areas if area.length_px >= _MIN_RATIO * median_px)
 
 
 def _candidates(pair: _Pair) -> NDArray[np.int64]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agalign.fit import displacement_field
-from agalign.fit.displacement_field import DisplacementEstimator, _Gain, common_field, fitted_field
+from agalign.fit.displacement_field import DisplacementEstimator, _are_decreased, common_field, fitted_field
 from agalign.fit.held_out import every_nth, held_out, one_by_one
 from agalign.fit.windows import Shifts
 from agalign.pixels.structure import structure_field
@@ -125,9 +125,10 @@ def test_a_field_without_held_out_windows_is_rejected(monkeypatch: pytest.Monkey
 
 
 def test_a_field_that_clearly_increases_p95_is_rejected() -> None:
-    for after_p95_px, is_significant in ((1.62, True), (1.69, False)):
-        gain = _Gain(1.0, before_p95_px=1.59, after_p95_px=after_p95_px, loss=0.1, sigma=9.0)
-        assert gain.is_significant(4.0) == is_significant
+    before_px, most_px = np.r_[np.full(90, 0.4), np.full(10, 1.59)], np.full(90, 0.1)
+    for after_p95_px, is_decreased in ((1.62, True), (1.69, False)):
+        assert _are_decreased(before_px, np.r_[most_px, np.full(10, after_p95_px)]) == is_decreased
+    assert not _are_decreased(before_px, before_px)
 
 
 # ---- what fits noise cannot pass

@@ -211,7 +211,7 @@ def test_windows_in_one_half_determine_the_lens_in_the_other_half_to_the_stated_
     ratios = []
     for seed in range(30):
         fit = fitted(windows(TRUTH_PX, LEFT, seed=seed), lens=True)
-        ratios.append(rms(jacobian(RIGHT, SIZE) @ (means_px(fit) - TRUTH_PX)) / std_px(fit, RIGHT))
+        ratios.append(rms(jacobian(RIGHT, SIZE, len(TRUTH_PX)) @ (means_px(fit) - TRUTH_PX)) / std_px(fit, RIGHT))
     # Errors of windows are assumed to be correlated; independent ones have smaller errors.
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.0
     assert std_px(fit, LEFT) < 0.15 < std_px(fit, RIGHT)
