@@ -76,7 +76,7 @@ class BandPair:
         """Size of a pixel of the reference's file, px of the fixed image; 1 for a coarse band, which has lower
         resolution.
         """
-        return 1.0 if self.is_coarse else min(self.scales.fixed)
+        return 1.0 if self.is_coarse else self.scales.fixed.mean
 
     @property
     def max_shift_px(self) -> float:
@@ -179,7 +179,7 @@ class BandPair:
 
     def in_reference_file_px(self, distance_px: float) -> float:
         """Convert a distance in the fixed image to the reference's file."""
-        return float(distance_px / min(self.scales.fixed))
+        return distance_px / self.scales.fixed.mean
 
     def in_moving_file_px(self, distance_px: float, fixed_to_moving: Matrix) -> float:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""
@@ -252,7 +252,7 @@ def _pair(
     scales = PairScales.of((band.size_px, bands[0].size_px), (reference.image.size_px, moving.size_px))
     reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
     tags_std_px = 5.0  # their errors in flights have medians of 2 to 9 px and a maximum of 12 px (benchmarks/seeds.py)
-    std_px: dict[SeedKind, float] = dict.fromkeys(_TAGS, tags_std_px * scales.fixed.x)
+    std_px: dict[SeedKind, float] = dict.fromkeys(_TAGS, tags_std_px * scales.fixed.mean)
     layout = relative_parallax(band, bands[0])
     pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, layout=layout)
     return pair if model is None or model.rig is None or not pair.has_rig_pixels else _with_rig(pair, model.rig)
@@ -265,7 +265,7 @@ def _with_rig(pair: BandPair, rig: Rig) -> BandPair:
     if pair.name not in rig.mean:
         return pair
     min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
-    std_px = max(unobserved_error_px(rig, pair.name, by_neighbours=False), min_std_px) * scale.x
+    std_px = max(unobserved_error_px(rig, pair.name, by_neighbours=False), min_std_px) * scale.mean
     return replace(
         pair,
         seed_std_px={**pair.seed_std_px, "model": std_px},
