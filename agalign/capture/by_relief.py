@@ -7,7 +7,6 @@ another time or is noisy, gets a homography and a baseline of its own under that
 with the same reference image that does not follow it is `predicted`; bands of much lower resolution have another one.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,14 +17,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate, RefinedBand, mapping_error
+from agalign.capture.common_parallax import (
+    MIN_BANDS,
+    MIN_PARALLAX_PX,
+    common_parallax_px,
+    consistent_bands,
+    layout_of,
+    parallax_groups,
+)
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.window_fit import (
-    Adjustment,
     BaselinePrior,
     WindowFit,
     WindowShifts,
@@ -33,10 +38,8 @@ from agalign.fit.window_fit import (
     are_of_lenses,
     are_on_a_line,
     fit_in_rounds,
-    fit_windows,
     parallax_of,
 )
-from agalign.fit.windows import residual_under
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import BY_WINDOWS, JointResult
 from agalign.values.choices import Geometry, ReliefUse
@@ -48,10 +51,6 @@ from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual, decrease_in_standard_errors, lengths_in_common_px
 from agalign.verify.checks import MAX_SHIFT_PX
 
-MIN_PARALLAX_PX = 0.3
-"""Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
-_MIN_BANDS = 2
-"""Minimum number of moving lenses: a relief is verified with the other lenses."""
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
 with booms and plants at 1 m."""
@@ -80,10 +79,10 @@ def by_relief(
     # would follow them too.
     max_line_px = 1.0
     with_relief: list[list[RefinedBand]] = []
-    for group in _parallax_groups(bands):
-        if len(group) < _MIN_BANDS:
+    for group in parallax_groups(bands):
+        if len(group) < MIN_BANDS:
             continue
-        parallax_px, on_a_line = _common_parallax_px(group)
+        parallax_px, on_a_line = common_parallax_px(group)
         if on_a_line and parallax_px > max_line_px:
             along_a_line |= {band.pair.name for band in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
@@ -94,105 +93,6 @@ def by_relief(
             under = _observed(group) if is_observation else _of_group(group, others)
             reliefs += [under] if under else []
     return reliefs, along_a_line
-
-
-def _parallax_groups(bands: Sequence[RefinedBand]) -> list[list[RefinedBand]]:
-    """Group the bands by reference image and space of the homographies; sharp ones only, if these are enough.
-
-    Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
-    """
-    groups: dict[tuple[int, str], list[RefinedBand]] = {}
-    for band in bands:
-        pair, residual = band.pair, band.warped.residual
-        is_reliable = band.joint.is_retrieved and len(residual.measured_px) >= MIN_WINDOWS
-        if is_reliable and not pair.is_coarse:
-            groups.setdefault((id(pair.reference), pair.space), []).append(band)
-    sharp = [[b for b in group if not b.pair.is_blurred] for group in groups.values()]
-    return [some if len(some) >= _MIN_BANDS else group for some, group in zip(sharp, groups.values(), strict=True)]
-
-
-def _common_parallax_px(group: Sequence[RefinedBand]) -> tuple[float, bool]:
-    """Return the p95 of the parallax that is common to the bands, 0 if there is none, and if the baselines are on one
-    line without tags that confirm them.
-
-    The distortion of the reference's lens is common to the bands too. What lens shapes explain is not parallax.
-    """
-    residuals = [_beyond_lens_shapes(b, r) for b, r in zip(group, _common_residuals(group), strict=True)]
-    # The p95 ignores single wrong peaks, which are not parallax.
-    if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
-        return 0.0, False
-    windows = WindowShifts.of(residuals, [band.warped.mapping for band in group])
-    consistent = _consistent_bands(windows, group)
-    if consistent is None:
-        return 0.0, False
-    bands, model = consistent
-    parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
-    return parallax_px, _layout_of([group[band].pair for band in bands]) is None and are_on_a_line(model.baselines)
-
-
-def _common_residuals(group: Sequence[RefinedBand]) -> list[Residual]:
-    """Return the residuals of all bands in the same windows: large ones if any band is blurred, else the smallest that
-    the residual of any band uses.
-    """
-    smallest = min((band.warped.windows for band in group), key=lambda windows: windows.side)
-    common = group[0].pair.reference.large_windows if any(band.pair.is_blurred for band in group) else smallest
-    return [b.warped.residual if b.warped.windows is common else common.residuals(b.warped.warped) for b in group]
-
-
-def _beyond_lens_shapes(band: RefinedBand, residual: Residual) -> Residual:
-    """Return the residual under the homography and the lens shapes that fit it, where no rig contains these."""
-    pair, mapping = band.pair, band.warped.mapping
-    if pair.unknown_lens_std_px is None:
-        return residual
-    fit = fit_windows(mapping, residual, pair.fixed.size_px, pair.unknown_lens_std_px)
-    assert fit is not None  # the prior of the shapes determines them
-    with suppress(GeometryError):
-        return residual_under(residual, mapping, fit.applied_to(mapping))
-    return residual
-
-
-def _layout_of(pairs: Sequence[BandPair]) -> NDArray[np.float64] | None:
-    """Return the layouts (bands, 2) of pairs; None if the tags lack one."""
-    layouts = [pair.layout for pair in pairs]
-    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
-
-
-def _consistent_bands(
-    windows: WindowShifts, group: Sequence[RefinedBand], lens_std: NDArray[np.float64] | None = None
-) -> tuple[list[int], Adjustment] | None:
-    """Adjust the model to the bands with common parallax; return their indices and the model, or None.
-
-    A band that the parallax of the others does not explain is left out, one after another. Lens shapes are fitted with
-    the standard deviations `lens_std` (4,), not without.
-    """
-    size_px = group[0].pair.fixed.size_px
-    # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of
-    # another time. Residuals below the minimum are accepted anyway.
-    max_scale_ratio, min_foreign_px = 2.0, 0.4
-
-    def adjusted(bands: Sequence[int], lens_std: NDArray[np.float64] | None) -> Adjustment | None:
-        layout, some = _layout_of([group[band].pair for band in bands]), windows.of_bands(bands)
-        model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
-        return model if model is not None and are_of_lenses(model.baselines, layout) else None
-
-    def without(foreign: int) -> tuple[float, int]:
-        """Return the residual scale without a band, px, infinite if no model exists, and the windows of the band."""
-        model, own = adjusted([b for b in kept if b != foreign], None), int((windows.weights[:, foreign] > 0).sum())
-        return math.inf if model is None else float(np.median(model.scales_px)), own
-
-    kept = list(range(windows.shifts_px.shape[1]))
-    model = adjusted(kept, lens_std)
-    while len(kept) > _MIN_BANDS:
-        if model is None:
-            kept.remove(min(kept, key=without))
-        else:
-            worst = int(model.scales_px.argmax())
-            others_px = float(np.median(np.delete(model.scales_px, worst)))
-            if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
-                break
-            kept.pop(worst)
-        model = adjusted(kept, lens_std)
-    return None if model is None else (kept, model)
 
 
 @dataclass(frozen=True)
@@ -262,13 +162,13 @@ def _observed(group: Sequence[RefinedBand]) -> UnderRelief:
     bands, reference = [_Band(b, b.warped.mapping) for b in group], group[0].pair.reference
     rounds, model = 2, None  # large shifts are measured in steps
     for _ in range(rounds):
-        consistent = _consistent_bands(_window_shifts(bands), [b.refined for b in bands])
+        consistent = consistent_bands(_window_shifts(bands), [b.refined for b in bands])
         if consistent is None:
             return {}
         kept, model = consistent
         bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
     assert model is not None
-    if _layout_of([b.refined.pair for b in bands]) is None and are_on_a_line(model.baselines):
+    if layout_of([b.refined.pair for b in bands]) is None and are_on_a_line(model.baselines):
         return {}
     warped = [band.refined.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.relief_check_windows.residuals(image) for image in warped]
@@ -332,11 +232,11 @@ class _Estimate:
         """
         planes, size_px = [_Band(b, b.warped.mapping) for b in group], group[0].pair.fixed.size_px
         lens_std = None if any(b.pair.has_rig for b in group) else group[0].pair.lens_std_px
-        consistent = _consistent_bands(_window_shifts(planes), group, lens_std)
+        consistent = consistent_bands(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
         kept, model = consistent
-        layout = _layout_of([group[k].pair for k in kept])
+        layout = layout_of([group[k].pair for k in kept])
         bands = [planes[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
         max_rounds = 3
         for _ in range(max_rounds):
@@ -387,7 +287,7 @@ class _Estimate:
         The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
         GeometryError.
         """
-        prior, layout = BaselinePrior(), _layout_of([band.pair, *(b.refined.pair for b in self.bands)])
+        prior, layout = BaselinePrior(), layout_of([band.pair, *(b.refined.pair for b in self.bands)])
         if layout is not None:
             own, others, baselines = layout[0], layout[1:], _baselines(self.bands)
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline

@@ -19,10 +19,7 @@ from agalign.capture import by_relief as relief_module
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import (
-    MIN_PARALLAX_PX,
     UnderRelief,
-    _common_parallax_px,
-    _consistent_bands,
     _decreases_shifts,
     _Estimate,
     _is_relief_accepted,
@@ -32,6 +29,7 @@ from agalign.capture.by_relief import (
 )
 from agalign.capture.by_rig import _parallax_by_rig, rig_predictions
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
+from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px, consistent_bands
 from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
@@ -165,7 +163,7 @@ def without_layout(candidates: Sequence[RefinedBand]) -> list[RefinedBand]:
 
 
 def shows_relief(candidates: Sequence[RefinedBand]) -> bool:
-    parallax_px, on_a_line = _common_parallax_px(candidates)
+    parallax_px, on_a_line = common_parallax_px(candidates)
     return parallax_px >= MIN_PARALLAX_PX and not on_a_line
 
 
@@ -285,8 +283,8 @@ def test_bands_along_a_line_do_not_follow_the_relief_of_other_bands(
 ) -> None:
     *on_a_line, other = candidates[:3]
     with_relief, offered = [other, other], list[list[RefinedBand]]()
-    monkeypatch.setattr(relief_module, "_parallax_groups", lambda _: [with_relief, on_a_line])
-    monkeypatch.setattr(relief_module, "_common_parallax_px", lambda group: (2.0, group is on_a_line))
+    monkeypatch.setattr(relief_module, "parallax_groups", lambda _: [with_relief, on_a_line])
+    monkeypatch.setattr(relief_module, "common_parallax_px", lambda group: (2.0, group is on_a_line))
     monkeypatch.setattr(relief_module, "_of_group", lambda _, others: offered.append(others))
     assert by_relief(candidates, "auto") == ([], {band.pair.name for band in on_a_line})
     assert offered == [[band for band in candidates if band not in on_a_line]]
@@ -582,7 +580,7 @@ def test_bands_with_few_windows_leave_the_parallax_to_the_others(candidates: Seq
     shifts_px = np.stack([known[b] for b in order], axis=1)
     windows = WindowShifts(points, points, shifts_px, np.isfinite(shifts_px[..., 0]).astype(float))
     group = [with_pair(candidates[0], layout=baselines[b]) for b in order]
-    kept, _ = _consistent_bands(windows, group)
+    kept, _ = consistent_bands(windows, group)
     assert {order[k] for k in kept} == {"A", "B"}
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from agalign.batch.products import PRODUCTS
-from agalign.capture import by_relief, reference
+from agalign.capture import common_parallax, reference
 from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
@@ -151,7 +151,7 @@ LIMITS = {
         f"narrower than {masks._MIN_SATURATED_PX} px are not masked",
         f"standard deviation of {displacement_field._NOISE_PX / displacement_field._SMOOTHNESS**0.5:.2f} px",
         f"by more than {refine._FINAL_CONVERGED_PX:g} px",
-        f"the p95 of the windows' parallax is at least {by_relief.MIN_PARALLAX_PX:g} px",
+        f"the p95 of the windows' parallax is at least {common_parallax.MIN_PARALLAX_PX:g} px",
         f"nodes every {displacement_field._LATTICE_PX} px",
         f"fitted to windows of {displacement_field._FIELD_WINDOW_PX} px",
         f"Images above {reference.LONGEST_SIDE_PX} px",
