@@ -5,7 +5,7 @@ the gradient magnitude, clipped so that a few strong edges do not dominate.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -35,7 +35,9 @@ def structure_field(raster: Raster) -> Field:
         return np.zeros(raster.valid.shape, np.complex64)
     # a ((gx + i gy) / |g|)^2 with a = min(|g| / ceiling, 1)
     planes = np.empty((*gx.shape, 2), np.float32)
-    for rows in _strips(gx.shape):
+    strip_rows = max(1, (1 << 15) // gx.shape[1])  # strips that fit into the CPU's cache take a third less time
+    for first in range(0, len(gx), strip_rows):
+        rows = slice(first, first + strip_rows)
         x, y, weight = gx[rows], gy[rows], np.maximum(magnitude[rows], np.float32(ceiling))
         weight *= magnitude[rows]
         np.divide(inside[rows], np.maximum(weight, np.float32(1e-30), out=weight), out=weight)
@@ -47,25 +49,12 @@ def structure_field(raster: Raster) -> Field:
     return np.asarray(planes.view(np.complex64)[..., 0])
 
 
-def _strips(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield the rows of an image (height, width) in strips that fit into the CPU's cache: a third faster."""
-    strip_px = 1 << 15
-    height, width = shape
-    step = max(1, strip_px // max(width, 1))
-    return (slice(first, first + step) for first in range(0, height, step))
-
-
 def gradient_magnitude(gx: FloatImage, gy: FloatImage) -> FloatImage:
     """Return sqrt(gx^2 + gy^2), (height, width).
 
     The last digit of cv2.magnitude depends on the memory alignment of its arrays; this result is reproducible.
     """
-    result = np.empty_like(gx)
-    for rows in _strips(gx.shape):
-        square = gx[rows] * gx[rows]
-        square += gy[rows] * gy[rows]
-        np.sqrt(square, out=result[rows])
-    return result
+    return np.sqrt(gx * gx + gy * gy)
 
 
 @dataclass(frozen=True)
