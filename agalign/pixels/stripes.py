@@ -34,13 +34,11 @@ def without_common_stripes(images: Sequence[Raster]) -> list[Raster]:
     significant pattern.
     """
     result = list(images)
-    sizes = {image.size_px for image in images if image.channels == 1}
-    for size in sizes:
+    for size in {image.size_px for image in images if image.channels == 1}:
         indices = [i for i, image in enumerate(images) if image.size_px == size and image.channels == 1]
-        if len(indices) < 2 or min(size) < _MIN_SIDE_PX:
-            continue
-        for i, cleaned in zip(indices, _cleaned([images[i] for i in indices]), strict=True):
-            result[i] = cleaned
+        if len(indices) > 1 and min(size) >= _MIN_SIDE_PX:
+            for i, cleaned in zip(indices, _cleaned([images[i] for i in indices]), strict=True):
+                result[i] = cleaned
     return result
 
 
@@ -48,46 +46,50 @@ def _cleaned(images: Sequence[Raster]) -> list[Raster]:
     # Minimum correlation of one half of a band with the other half of another band, median over bands. Captures
     # of eight cameras without stripes have up to 0.14, white stripes of 5 % of the range 0.34, of 2 % 0.08.
     min_correlation = 0.3
-    axes = [axis for axis in (0, 1) if _common_correlation(images, axis) >= min_correlation]
-    if not axes:
+    has_columns = _common_correlation(images) >= min_correlation
+    has_rows = _common_correlation(_transposed(images)) >= min_correlation
+    if not has_columns and not has_rows:
         return list(images)
-    result = list(images)
-    for axis in axes:
-        result = _without_pattern(result, axis)
+    result = _without_columns(images) if has_columns else list(images)
+    if has_rows:
+        result = _transposed(_without_columns(_transposed(result)))
     if _are_registered(result):
         _LOG.debug("a common row or column pattern of co-registered bands is kept: it may be part of the scene")
         return list(images)
-    _LOG.debug(
-        "removed a pattern of %s that the bands have in common", " and ".join(("columns", "rows")[a] for a in axes)
-    )
+    removed = ["columns"] * has_columns + ["rows"] * has_rows
+    _LOG.debug("removed a pattern of %s that the bands have in common", " and ".join(removed))
     return result
 
 
-def _common_correlation(images: Sequence[Raster], axis: int) -> float:
+def _transposed(images: Sequence[Raster]) -> list[Raster]:
+    """Return the images with their rows as columns."""
+    return [
+        replace(image, pixels=np.ascontiguousarray(image.pixels.T), valid=np.ascontiguousarray(image.valid.T))
+        for image in images
+    ]
+
+
+def _common_correlation(images: Sequence[Raster]) -> float:
     """Return the correlation of opposite halves of the first band and each other band, median over bands."""
-    (upper, lower), *others = (_halves(image, axis) for image in images)
+    (upper, lower), *others = (_halves(image) for image in images)
     return float(np.median([(_correlation(upper, low) + _correlation(lower, up)) / 2 for up, low in others]))
 
 
-def _halves(image: Raster, axis: int) -> tuple[_Profile, _Profile]:
-    """Return the median differences of neighbouring columns (axis 0) or rows (axis 1) in both halves of the image."""
+def _halves(image: Raster) -> tuple[_Profile, _Profile]:
+    """Return the median differences of neighbouring columns in the upper and in the lower half of the image."""
     width, height = image.size_px
     lines = 32  # of averages, before their median; 128 give the same result in twice the time
-    size = (width, min(lines, height)) if axis == 0 else (min(lines, width), height)
     blocks, weights = (
-        cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+        cv2.resize(plane, (width, min(lines, height)), interpolation=cv2.INTER_AREA)
         for plane in (image.pixels, image.valid.astype(np.float32))
     )
-    if axis == 1:
-        blocks, weights = np.ascontiguousarray(blocks.T), np.ascontiguousarray(weights.T)
     # Smoothed as the structure field: higher frequencies, such as even and odd lines that differ, do not matter.
     smoothing_px, kernel_px = 1.0, 7
     differences = np.diff(cv2.GaussianBlur(blocks, (kernel_px, 1), smoothing_px), axis=1)
     known = (weights > MIN_VALID_WEIGHT).astype(np.uint8)
     valid = cv2.erode(known, np.ones((1, kernel_px), np.uint8), borderValue=0) > 0
     differences[~(valid[:, 1:] & valid[:, :-1])] = 0
-    middle = len(differences) // 2
-    upper, lower = (np.median(part, axis=0).astype(float) for part in (differences[:middle], differences[middle:]))
+    upper, lower = (np.median(half, axis=0).astype(float) for half in np.split(differences, [len(differences) // 2]))
     return upper, lower
 
 
@@ -96,9 +98,9 @@ def _correlation(a: _Profile, b: _Profile) -> float:
     return float(np.mean((a - a.mean()) * (b - b.mean())) / norm) if norm > 0 else 0.0
 
 
-def _without_pattern(images: Sequence[Raster], axis: int) -> list[Raster]:
-    """Subtract the common pattern, scaled to each image."""
-    differences = np.stack([_differences(image, axis) for image in images])
+def _without_columns(images: Sequence[Raster]) -> list[Raster]:
+    """Subtract the common pattern of columns, scaled to each image."""
+    differences = np.stack([_differences(image) for image in images])
     scale = np.sqrt(np.mean(differences**2, axis=1, keepdims=True))
     common = np.mean(differences / np.maximum(scale, 1e-12), axis=0)
     gains = differences @ common / max(float(common @ common), 1e-12)
@@ -107,21 +109,16 @@ def _without_pattern(images: Sequence[Raster], axis: int) -> list[Raster]:
     # Of 15, 40 and 80 px, 15 px has the smallest residual for white stripes.
     drift_px = 15.0
     pattern -= gaussian_filter1d(pattern, drift_px, mode="nearest")
-    result = []
-    for image, gain in zip(images, gains, strict=True):
-        scaled = np.asarray(gain * pattern, np.float32)
-        pixels = image.pixels - (scaled if axis == 0 else scaled[:, None])
-        result.append(replace(image, pixels=np.where(image.valid, pixels, np.float32(0))))
-    return result
+    return [
+        replace(image, pixels=np.where(image.valid, image.pixels - np.float32(gain * pattern), np.float32(0)))
+        for image, gain in zip(images, gains, strict=True)
+    ]
 
 
-def _differences(image: Raster, axis: int) -> _Profile:
-    """Return the median differences of neighbouring columns (axis 0) or rows (axis 1) over the valid pixels."""
-    pixels, valid = (image.pixels, image.valid) if axis == 0 else (image.pixels.T, image.valid.T)
-    differences = np.diff(pixels, axis=1)
-    if valid.all():
-        return np.median(differences, axis=0).astype(np.float64)
-    differences[~(valid[:, 1:] & valid[:, :-1])] = np.nan
+def _differences(image: Raster) -> _Profile:
+    """Return the median differences of neighbouring columns over the valid pixels; 0 where there are none."""
+    differences = np.diff(image.pixels, axis=1)
+    differences[~(image.valid[:, 1:] & image.valid[:, :-1])] = np.nan
     known = np.isfinite(differences).any(axis=0)
     result = np.zeros(differences.shape[1])
     result[known] = np.nanmedian(differences[:, known], axis=0)
