@@ -25,7 +25,7 @@ from agalign.batch.capture_task import quiet
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import align_capture_bands
 from agalign.config import Settings
-from agalign.pixels.raster import ReadTile, read_tile, with_saturation_values
+from agalign.pixels.raster import ReadTile, read_tile, with_facts_of_pixels
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.image import FloatImage, Mask, Tile
@@ -69,7 +69,7 @@ class Aligned:
     @classmethod
     def of(cls, folder: Path) -> "Aligned":
         """Align the first capture of a folder."""
-        capture = with_saturation_values(discover(folder).captures[0])
+        capture = with_facts_of_pixels(discover(folder).captures[0], read_tile)
         pixels = {b.name: read_tile(b, Tile(0, 0, *b.size_px))[0] for b in capture.bands}
         return cls(capture, pixels, align_capture_bands(capture, Settings(), None, quiet))
 

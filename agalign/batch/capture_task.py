@@ -27,7 +27,7 @@ from agalign.host.process_pool import A, R
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.radiometry import with_checked_pixels
-from agalign.pixels.raster import ReadTile, with_missing_parts, with_saturation_values
+from agalign.pixels.raster import ReadTile, with_facts_of_pixels
 from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
 from agalign.rasters.product import CapturePaths, RenderOptions
 from agalign.rasters.read_alignment import alignments_of
@@ -102,7 +102,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     read, path, once = CapturePixels().read, CapturePaths.of(task.capture, out).sidecar, cache(read_with_change)
     refuse_to_overwrite([task.capture], out, settings.write, once)
     earlier, is_intact = earlier_result(path, once)
-    capture = with_saturation_values(with_missing_parts(task.capture, read), read)
+    capture = with_facts_of_pixels(task.capture, read)
     if missing := missing_lens(capture, settings.write) or missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
     if settings.write.radiometry != "off":

@@ -24,7 +24,7 @@ from agalign.method.joint import Results, refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.capture_pixels import CapturePixels
-from agalign.pixels.raster import with_missing_parts, with_saturation_values
+from agalign.pixels.raster import with_facts_of_pixels
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix, PairScales
@@ -161,8 +161,7 @@ def load_capture(
 def _pairs_of(capture: Capture, settings: Settings, model: FlightModel | None = None) -> list[BandPair]:
     """Return the pairs of a capture that can be read."""
     read = CapturePixels().read
-    capture = with_saturation_values(with_missing_parts(capture, read), read)
-    return read_pairs(capture, settings.seed, model, read)[0]
+    return read_pairs(with_facts_of_pixels(capture, read), settings.seed, model, read)[0]
 
 
 def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel | None) -> Descriptor:

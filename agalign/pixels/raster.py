@@ -4,7 +4,7 @@ import math
 import stat
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -191,25 +191,32 @@ def _full_scale(dataset: rasterio.DatasetReader, index: int) -> float | None:
     return 2.0 ** int(bits) - 1 if maximum and bits.isdecimal() else maximum
 
 
-def with_saturation_values(capture: Capture, read: ReadTile | None = None) -> Capture:
-    """Return the capture with the saturation values that the pixels show: many cameras store 10 or 12 bits in 16.
+def with_facts_of_pixels(capture: Capture, read: ReadTile) -> Capture:
+    """Return the capture with what its pixels show: the parts that its files lack, and the saturation values.
 
-    Bands with a saturation value by their tags or 8 bits, and those that cannot be read, are unchanged. `read` reads
-    the pixels of the files, by default `read_tile`.
+    Bands that cannot be read are unchanged. `read` reads the pixels of the files.
     """
-    return replace(capture, bands=tuple(_with_saturation_value(band, read or read_tile) for band in capture.bands))
+    bands_of = Counter((b.path, b.page) for b in capture.bands)
+    bands = []
+    for band in capture.bands:
+        known, is_single = band, bands_of[band.path, band.page] == band.index_in_page == 1
+        with suppress(UnreadableFileError):
+            known = replace(band, missing=_missing_parts(band, read) if is_single else ())
+            known = replace(known, saturation_value=_saturation_value(known, read))
+        bands.append(known)
+    return replace(capture, bands=tuple(bands))
 
 
-def _with_saturation_value(band: Band, read: ReadTile) -> Band:
+def _saturation_value(band: Band, read: ReadTile) -> float | None:
+    """The saturation value of a band: many cameras store 10 or 12 bits in 16. That by its tags or of 8 bits is known.
+
+    Raises UnreadableFileError.
+    """
     if band.saturation_value not in (_MAXIMA["uint16"], _MAXIMA["int16"]):
-        return band
+        return band.saturation_value
     side_px = 2048  # of the middle of the image, which limits the memory
     width, height = (min(side_px, n) for n in band.size_px)
-    try:
-        tile = Tile((band.width_px - width) // 2, (band.height_px - height) // 2, width, height)
-        pixels, valid = read(band, tile)
-    except UnreadableFileError:
-        return band
+    pixels, valid = read(band, Tile((band.width_px - width) // 2, (band.height_px - height) // 2, width, height))
     values = pixels[valid]
     top = values.max(initial=0)
     at_top = np.count_nonzero(values == top)
@@ -217,37 +224,26 @@ def _with_saturation_value(band: Band, read: ReadTile) -> Band:
     # Bright objects have many values; those of a saturated sensor are equal.
     min_share, min_ratio = 0.002, 10
     is_saturated = top > 0 and at_top >= max(min_share * values.size, min_ratio * (below.mean() if below.size else 0))
-    return replace(band, saturation_value=float(top)) if is_saturated and at_top < values.size else band
+    return float(top) if is_saturated and at_top < values.size else band.saturation_value
 
 
-def with_missing_parts(capture: Capture, read: ReadTile | None = None) -> Capture:
-    """Return the capture with the parts that the files of single bands lack at their end (`masks.missing_end`).
+def _missing_parts(band: Band, read: ReadTile) -> tuple[Tile, ...]:
+    """The parts that the file of a single band lacks at its end (`masks.missing_end`).
 
-    Stacks, maps and floating-point images, which programs fill at their borders, and files with a mask or a nodata
-    value are unchanged, and bands that cannot be read. `read` reads the pixels, by default `read_tile`.
+    Maps and floating-point images, which programs fill at their borders, and files with a mask or a nodata value lack
+    none. Raises UnreadableFileError.
     """
-    bands_of = Counter((b.path, b.page) for b in capture.bands)
-    is_single = [bands_of[b.path, b.page] == b.index_in_page == 1 for b in capture.bands]
-    bands = zip(capture.bands, is_single, strict=True)
-    return replace(capture, bands=tuple(_with_missing_parts(b, read or read_tile) if one else b for b, one in bands))
-
-
-def _with_missing_parts(band: Band, read: ReadTile) -> Band:
     is_raw = band.nodata is None and not band.has_mask and band.georeference is None
     if not is_raw or np.dtype(band.dtype).kind not in "ui":
-        return band
+        return ()
     corner_px = min(16, band.width_px)  # rows of images have several values
-    try:
-        last, _ = read(band, Tile(band.width_px - corner_px, band.height_px - 1, corner_px, 1))
-        if (last != last[0, 0]).any():
-            return band
-        pixels, _ = read(band, Tile(0, 0, *band.size_px))
-        with open_raster(band.path, band.page) as dataset:
-            block_height, block_width = dataset.block_shapes[band.index_in_page - 1]
-    except UnreadableFileError:
-        return band
-    parts = missing_end(pixels, (block_width, block_height), band.saturation_value)
-    return replace(band, missing=tuple(parts))
+    last, _ = read(band, Tile(band.width_px - corner_px, band.height_px - 1, corner_px, 1))
+    if (last != last[0, 0]).any():
+        return ()
+    pixels, _ = read(band, Tile(0, 0, *band.size_px))
+    with open_raster(band.path, band.page) as dataset:
+        block_height, block_width = dataset.block_shapes[band.index_in_page - 1]
+    return tuple(missing_end(pixels, (block_width, block_height), band.saturation_value))
 
 
 def value_step(band: Band) -> int:

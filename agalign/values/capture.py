@@ -153,7 +153,7 @@ class Band:
     """(scale, offset): value = scale * number in the file + offset."""
     missing: tuple[Tile, ...] = ()
     """Parts at the end of a damaged file that it has no pixels of: all have one value. Known of the bands that
-    `pixels.raster.with_missing_parts` returns."""
+    `pixels.raster.with_facts_of_pixels` returns."""
     overviews: tuple[int, ...] = ()
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None

@@ -15,7 +15,7 @@ from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import UnreadableFileError
-from agalign.pixels.raster import probe, read_for_alignment, read_tile, with_saturation_values
+from agalign.pixels.raster import probe, read_for_alignment, read_tile, with_facts_of_pixels
 from agalign.records.sidecar_file import find_sidecars, read_checked
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import Quality
@@ -34,7 +34,7 @@ def texture_numbers(bright: float = 0.0, seed: int = 0) -> np.ndarray:
 def saturation_of(path: Path, pixels: np.ndarray, **profile: object) -> float | None:
     write_band(path, pixels, **profile)
     capture = Capture("a", Path(), probe(path), 0)
-    return with_saturation_values(capture).bands[0].saturation_value
+    return with_facts_of_pixels(capture, read_tile).bands[0].saturation_value
 
 
 @pytest.mark.parametrize(("bits", "shift"), [(10, 0), (12, 0), (12, 4), (14, 2)])

@@ -11,7 +11,7 @@ import rasterio
 import agalign
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.masks import missing_end, without_parts
-from agalign.pixels.raster import probe, read_for_alignment, with_missing_parts
+from agalign.pixels.raster import probe, read_for_alignment, read_tile, with_facts_of_pixels
 from agalign.rasters.alignment_maps import Quality
 from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
@@ -104,20 +104,20 @@ FILLED: dict[str, dict[str, object]] = {
 @pytest.mark.parametrize("name", FILLED)
 def test_fill_of_maps_and_declared_nodata_are_not_missing(tmp_path: Path, name: str) -> None:
     write_band(tmp_path / "f.tif", cut(scene(), 4000), **FILLED[name])
-    assert with_missing_parts(capture_of(tmp_path / "f.tif")).bands[0].missing == ()
+    assert with_facts_of_pixels(capture_of(tmp_path / "f.tif"), read_tile).bands[0].missing == ()
 
 
 def test_fill_of_stacks_and_floats_is_not_missing(tmp_path: Path) -> None:
     write_band(tmp_path / "stack.tif", np.stack([cut(scene(), 4000)] * 3))
     write_band(tmp_path / "float.tif", cut(scene(), 4000).astype(np.float32))
     for name in ("stack", "float"):
-        assert not any(b.missing for b in with_missing_parts(capture_of(tmp_path / f"{name}.tif")).bands)
+        assert not any(b.missing for b in with_facts_of_pixels(capture_of(tmp_path / f"{name}.tif"), read_tile).bands)
 
 
 def test_missing_pixels_are_invalid_at_every_resolution(tmp_path: Path) -> None:
     write_band(tmp_path / "f.tif", cut(scene(), 48 * WIDTH, 77))
     read = CapturePixels().read
-    (band,) = with_missing_parts(capture_of(tmp_path / "f.tif"), read).bands
+    (band,) = with_facts_of_pixels(capture_of(tmp_path / "f.tif"), read).bands
     assert band.missing_rows == 32
     _, valid = read(band, Tile(0, 40, WIDTH, 40))
     assert (valid[:8].all(), valid[8:].any()) == (True, False)
