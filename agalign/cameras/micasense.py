@@ -55,21 +55,16 @@ class MicaSense(Camera):
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         numbered = self.band_in_name.search(own_stem(path))
-        band = pix4d.described(stored[0], tags, f"band{numbered[0]}" if numbered else path.stem)
-        lens = pix4d.perspective_lens(tags)
-        offset = pix4d.lens_offset(tags)
-        known_parallax = _REDEDGE_M_PARALLAX.get(band.name) if tags.model == "RedEdge-M" else None
-        centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
+        described = pix4d.described(stored[0], tags, f"band{numbered[0]}" if numbered else path.stem)
+        lens, offset = pix4d.perspective_lens(tags), pix4d.lens_offset(tags)
+        known_parallax = _REDEDGE_M_PARALLAX.get(described.name) if tags.model == "RedEdge-M" else None
         saturation, max_twelve_bit_value = stored[0].saturation_value, 65520.0  # stored in the upper bits of uint16
         band = replace(
-            band,
+            _with_radiometry(described, tags),
             saturation_value=saturation if saturation is None else min(saturation, max_twelve_bit_value),
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax_direction=known_parallax if offset is None else (-offset[0], -offset[1]),
-            radiometry=centikelvin if is_thermal(band) else _radiometry(tags, stored[0]),
-            missing_calibration="" if is_thermal(band) else _without_calibration(tags),
-            implausible="" if is_thermal(band) else irradiance(tags).problem,
             lens_offset=offset,
         )
         return (band,)
@@ -88,7 +83,7 @@ class MicaSense(Camera):
         is_known = bool(re.fullmatch(r"RedEdge(?!-P).*", tags.model)) and len(a) == 3 and bool(sensitivity)
         if is_known and not agreed((a[0] * (sensitivity or 0.0), _COEFFICIENT_BY_SENSITIVITY))[1]:
             yield f"its RadiometricCalibration {a[0]:g} and BandSensitivity {sensitivity:g} contradict each other"
-        iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
+        iso = _iso(tags)
         if iso and not any(abs(iso - 100 * 2**k) < 1 for k in range(6)):
             yield f"its sensor gain of {iso / 100:g} is not one of 1, 2, 4, 8 …"
         dark = tags.numbers(NAMESPACE, "DarkRowValue", 4)
@@ -105,41 +100,42 @@ class MicaSense(Camera):
         return sun_by_sensor(tags)
 
 
-def _radiometry(tags: Tags, stored: Band) -> Radiometry | None:
-    """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 2^bits, vignetting V, gain g = ISO / 100,
+def _iso(tags: Tags) -> float | None:
+    return finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
+
+
+def _with_radiometry(band: Band, tags: Tags) -> Band:
+    """The band with the calibration in its tags, or with what they lack or have wrongly.
+
+    L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 2^bits, vignetting V, gain g = ISO / 100,
     exposure time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
-    a = tags.numbers(NAMESPACE, "RadiometricCalibration", 3)
-    exposure_s = finite(tags.exif.get("ExposureTime"))
-    iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
-    if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
-        return None
+    if is_thermal(band):
+        centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
+        return replace(band, radiometry=centikelvin)
     light = irradiance(tags)
+    band = replace(band, implausible=light.problem)
+    a, exposure_s = tags.numbers(NAMESPACE, "RadiometricCalibration", 3), finite(tags.exif.get("ExposureTime"))
+    black_level, iso = tags.black_level, _iso(tags)
+    if len(a) != 3 or not exposure_s or black_level is None or not iso:
+        has = {"RadiometricCalibration": len(a) == 3, "ExposureTime": exposure_s, "ISOSpeed": iso}
+        has["BlackLevel"] = black_level is not None
+        missing = ", ".join(name for name, value in has.items() if not value)
+        return replace(band, missing_calibration=f"no tag {missing} for radiance")
     of_sensor = {"irradiance (W / m^2 / nm)": light.value} if light.value else {}  # 0 without a reading
     centre, k = pix4d.vignetting(tags)
-    return Radiometry(
+    radiometry = Radiometry(
         "radiance",
-        tags.black_level,
-        full_scale(stored),
+        black_level,
+        full_scale(band),
         a[0] / (iso / 100) / exposure_s,
         centre,
         k,
         True,
         a[1] / exposure_s - a[2],
         ReflectanceFactor(math.pi / light.value, errors=light.errors) if light.value > 0 else None,
-        raw_step=raw_step_of(tags, stored),
+        raw_step=raw_step_of(tags, band),
         tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s} | of_sensor,
         errors=(FACTORY_CALIBRATION,) if k else (FACTORY_CALIBRATION, NO_VIGNETTING["MicaSense"]),
     )
-
-
-def _without_calibration(tags: Tags) -> str:
-    """The tags that radiance needs and the file lacks, in words; empty if it lacks none."""
-    has = {
-        "RadiometricCalibration": tags.numbers(NAMESPACE, "RadiometricCalibration", 3),
-        "ExposureTime": finite(tags.exif.get("ExposureTime")),
-        "ISOSpeed": finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings"))),
-        "BlackLevel": tags.black_level is not None,
-    }
-    missing = [name for name, value in has.items() if not value]
-    return f"no tag {', '.join(missing)} for radiance" if missing else ""
+    return replace(band, radiometry=radiometry)
