@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +17,6 @@ from agalign.values.image import OutputGrid
 
 _MAX_TILT_DEG = 45.0
 """The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
-
-
-class PoseErrors(NamedTuple):
-    """Standard errors of the pose of a camera by its tags."""
-
-    position_m: float
-    """Of a GPS receiver without corrections."""
-    height: float
-    """Relative to the height above ground."""
-    heading: float
-    """Radians, of a magnetic heading."""
-    tilt: float
-    """Radians."""
 
 
 def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
@@ -132,13 +118,6 @@ def with_approximate_georeference(capture: Capture, crs: str) -> Capture:
     return replace(capture, bands=bands)
 
 
-def pose_errors(height_m: float | None, height_from: str | None, *, has_tilt: bool = False) -> PoseErrors:
-    """Return the standard errors of a camera's pose. Without a height, that of the height is zero."""
-    # Assumed height; barometric height over uneven ground. Gimbal or attitude sensor; camera fixed to an aircraft.
-    height = 0.5 if height_from == "assumed" else 5.0 / height_m if height_m else 0.0
-    return PoseErrors(3.0, height, math.radians(5.0), math.radians(2.0 if has_tilt else 7.0))
-
-
 def accuracy_of_footprint_m(capture: Capture) -> float | None:
     """Return the standard error, metres, of the farthest corner of a footprint: that of a georeference, if it is known,
     or by `ground_m` from the errors of the camera's position, heading, tilt and height. None if it is not known.
@@ -151,10 +130,14 @@ def accuracy_of_footprint_m(capture: Capture) -> float | None:
         return None
     distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
     tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
-    errors = pose_errors(pose.height_m, pose.height_from, has_tilt=bool(pose.pitch_deg or pose.roll_deg))
-    tilted_m = errors.tilt * pose.height_m * (1 + tangent**2)
-    errors_m = errors.position_m, errors.heading * distance_m, tilted_m, errors.height * pose.height_m * tangent
-    return round(math.hypot(*errors_m), 1)
+    position_std_m = 3.0  # of a GPS receiver without corrections
+    heading_std = math.radians(5.0)  # of a magnetic compass
+    # By a gimbal or attitude sensor; of a camera that is fixed to an aircraft.
+    tilt_std = math.radians(2.0 if pose.pitch_deg or pose.roll_deg else 7.0)
+    # Of an assumed height; of a barometric height over uneven ground.
+    height_std_m = 0.5 * pose.height_m if pose.height_from == "assumed" else 5.0
+    tilted_m = tilt_std * pose.height_m * (1 + tangent**2)
+    return round(math.hypot(position_std_m, heading_std * distance_m, tilted_m, height_std_m * tangent), 1)
 
 
 def utm_wkt(longitude: float, latitude: float) -> str:

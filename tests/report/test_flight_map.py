@@ -20,7 +20,6 @@ from agalign.flight.footprint import (
     footprint,
     ground_m,
     missing_for_footprint,
-    pose_errors,
     utm_of_flights,
     utm_wkt,
     with_approximate_georeference,
@@ -103,9 +102,9 @@ def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_
 def test_the_accuracy_is_that_of_the_farthest_corner() -> None:
     """Two pixels that cover 40 m each: the corner is 40 m east and 20 m north, not half a pixel farther."""
     tiny = replace(capture(Pose(0.0, height_m=40.0, focal_length_px=1.0)), bands=(Band("G", Path(), 1, 2, 1, "uint8"),))
-    errors, distance_m = pose_errors(40.0, "tags"), math.hypot(40, 20)
-    tilted_m = errors.tilt * 40 * (1 + (distance_m / 40) ** 2)
-    terms_m = errors.position_m, errors.heading * distance_m, tilted_m, errors.height * distance_m
+    distance_m = math.hypot(40, 20)
+    tilted_m = math.radians(7.0) * 40 * (1 + (distance_m / 40) ** 2)
+    terms_m = 3.0, math.radians(5.0) * distance_m, tilted_m, 5.0 / 40 * distance_m
     assert accuracy_of_footprint_m(tiny) == pytest.approx(math.hypot(*terms_m), abs=0.06)
 
 
