@@ -186,15 +186,6 @@ def _converted(
     )
 
 
-def _polynomial(x: NDArray[np.float64], coefficients: Sequence[float]) -> NDArray[np.float64]:
-    """Return the sum of c_k x^k (...) by Horner's scheme; in place, which is three times as fast as NumPy's."""
-    result = np.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        result *= x
-        result += coefficient
-    return result
-
-
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:
     """Calibrate raw pixels (H, W) to float32; the top left pixel is (x0, y0) of the file."""
     height, width = pixels.shape
@@ -209,7 +200,7 @@ def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0:
         if any(radiometry.vignetting):
             cx, cy = radiometry.vignetting_centre_px
             r = np.sqrt(((x - cx) ** 2)[None, :] + ((y - cy) ** 2)[:, None])  # a third of the time of np.hypot
-            falloff = _polynomial(r, (1.0, *radiometry.vignetting))
+            falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
             (np.divide if radiometry.vignetting_divides else np.multiply)(signal, falloff, out=signal)
         if radiometry.row_gradient:
             signal /= 1.0 + radiometry.row_gradient * y[:, None]
