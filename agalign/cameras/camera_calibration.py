@@ -22,15 +22,14 @@ def with_complete_calibrations(files: Sequence[ImageFile]) -> list[ImageFile]:
     """
     by_camera: dict[object, list[ImageFile]] = defaultdict(list)
     for file in files:
-        by_camera[_camera(file)].append(file)
+        by_camera[file.unit].append(file)
     has_all = {}
     for key, of_camera in by_camera.items():
         known = [b.radiometry for file in of_camera for b in file.bands if b.radiometry]
         of_sun = [radiometry.by_sun.errors for radiometry in known if radiometry.by_sun]
         has_all[key] = _known(radiometry.errors for radiometry in known), _known(of_sun), bool(of_sun)
     return [
-        replace(file, bands=tuple(_without_incomplete(b, *has_all[_camera(file)]) for b in file.bands))
-        for file in files
+        replace(file, bands=tuple(_without_incomplete(b, *has_all[file.unit]) for b in file.bands)) for file in files
     ]
 
 
@@ -70,7 +69,7 @@ def different_calibrations(files: Sequence[ImageFile]) -> list[Problem]:
     for file in (f for f in files if len(f.bands) == 1):
         for what, value in _constants(file.bands[0]):
             band = "" if what == "black level" else band_key(file.bands[0].name)
-            factors[_camera(file), what, band].append((value, file))
+            factors[file.unit, what, band].append((value, file))
     problems = []
     for (_, what, _), found in factors.items():
         usual, count = Counter(value for value, _ in found).most_common(1)[0]
@@ -96,9 +95,3 @@ def _constants(band: Band) -> Iterator[tuple[str, float]]:
         # One number for all coefficients: the correction at a third of the image.
         r = max(band.size_px) / 3
         yield "vignetting", 1.0 + sum(k * r**n for n, k in enumerate(radiometry.vignetting, start=1))
-
-
-def _camera(file: ImageFile) -> tuple[object, ...]:
-    """Make, model and serial number; the folder without one."""
-    serial = file.tags.serial or file.camera.capture_folder(file.path)
-    return file.camera.name, file.tags.make, file.tags.model, serial

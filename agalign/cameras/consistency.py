@@ -246,18 +246,17 @@ def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
     """Return a problem for each position in the rig of one camera that changes its tags, and for bands with a name or
     wavelength that others contradict. `groups` are the files of each capture.
     """
-    tags: dict[tuple[str, ...], dict[str, list[ImageFile]]] = defaultdict(lambda: defaultdict(list))
+    tags: dict[tuple[object, str], dict[str, list[ImageFile]]] = defaultdict(lambda: defaultdict(list))
     doubtful: dict[str, list[Path]] = defaultdict(list)
     for group in groups:
         for file in (f for f in group if len(f.bands) == 1 and f.tags.text(NAMESPACE, "BandName")):
             if file.tags.unread is None and (position := _position(file)):
-                serial = file.tags.serial or str(file.camera.capture_folder(file.path))
                 label = with_wavelength(file.bands[0].name, file.bands[0].wavelength_nm)
-                tags[file.tags.make, file.tags.model, serial, position][label].append(file)
+                tags[file.unit, position][label].append(file)
         for text, path in _doubtful([b for file in group for b in file.bands if not b.is_from_photograph]):
             doubtful[text].append(path)
     texts = [(p[0], f"{text}, in {counted(len(p), 'file')}; correct the tags") for text, p in doubtful.items()]
-    for (*_, position), by_label in tags.items():
+    for (_, position), by_label in tags.items():
         bands = [files[0].bands[0] for files in by_label.values()]
         wavelengths = [b.wavelength_nm for b in bands if b.wavelength_nm is not None]
         is_one_name = len({band_key(b.name) for b in bands}) == 1
@@ -367,7 +366,7 @@ def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
     """
     apart: dict[str, list[tuple[ImageFile, float]]] = defaultdict(list)
     others: dict[str, list[float]] = defaultdict(list)
-    for group in (g for g in groups if len(g) > 1 and not g[0].tags.first_text(g[0].camera.capture_ids)):
+    for group in (g for g in groups if len(g) > 1 and not g[0].capture_id):
         times = {f.path: time_s for f in group if (time_s := known_time_s(f.tags.captured_at)) is not None}
         usual_s = median_low(times.values()) if times else 0.0
         for file in (f for f in group if f.path in times):

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from filecmp import cmp as same_bytes
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from types import MappingProxyType
 
@@ -55,19 +55,19 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
     """
     kept: dict[object, ImageFile] = {}
     copies: dict[Path, Problem] = {}
-    ids = {f.path: shortened(f.tags.first_text(f.camera.capture_ids)) for f in files}
     # A file that was copied over one of another capture has the name of the wrong siblings.
-    of_name = Counter((ids[f.path], f.camera.capture_name(f.path)) for f in files if ids[f.path])
-    siblings = {f.path: of_name[ids[f.path], f.camera.capture_name(f.path)] for f in files if ids[f.path]}
+    names = {f.path: (f.capture_id, f.camera.capture_name(f.path)) for f in files if f.capture_id}
+    of_name = Counter(names.values())
+    siblings = {path: of_name[name] for path, name in names.items()}
     for file in sorted(files, key=lambda f: (-siblings.get(f.path, 0), len(f.path.name), natural_order(f.path.name))):
         folder, bands = file.camera.capture_folder(file.path), tuple(b.name for b in file.bands)
-        by_tags = (folder, ids[file.path], bands) if ids[file.path] else file.path
+        by_tags = (folder, file.capture_id, bands) if file.capture_id else file.path
         for original in (kept[key] for key in (by_tags, *_paths_in_name(file.path)) if key in kept):
             is_exact = same_bytes(original.path, file.path, shallow=False)
             if is_exact:
                 text = f"is left out, because it is a copy of {original.path.name}"
             elif original.path in _paths_in_name(file.path) and (
-                original is kept.get(by_tags) if ids[file.path] else _is_plain_name(original, file.path)
+                original is kept.get(by_tags) if file.capture_id else _is_plain_name(original, file.path)
             ):
                 text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
             else:
@@ -90,7 +90,7 @@ def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile
     kept: dict[object, list[list[ImageFile]]] = defaultdict(list)
     copies: dict[tuple[Path, Path], _CopiedFolder] = defaultdict(_CopiedFolder)
     for group in sorted(groups, key=lambda g: (len(str(g[0].path.parent)), natural_order(str(g[0].path)))):
-        capture_id, here = group[0].tags.first_text(group[0].camera.capture_ids), group[0].path.parent
+        capture_id, here = group[0].capture_id, group[0].path.parent
         files = [(f.path.name, f.path.stat().st_size) for f in group]
         of_key = kept[(group[0].camera.name, capture_id) if capture_id else (_end_of(group[0].path), *files)]
         is_one = _is_of_one_moment if capture_id else _has_same_bytes
@@ -443,25 +443,23 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
 
 
 def with_unreadable_bands(
-    captures: Sequence[Capture], files: Iterable[ImageFile], problems: Iterable[Problem]
+    captures: Sequence[Capture], files: Sequence[ImageFile], problems: Iterable[Problem]
 ) -> list[Capture]:
     """Return the captures with the reasons why files of their missing bands cannot be read. The name of such a file
     tells its capture and, by the readable `files` or what is known of the camera, its band.
     """
     if not (unreadable := {p.path: p.error for p in problems if isinstance(p.error, UnreadableFileError)}):
         return list(captures)
-    of_path = {file.path: file for file in files}
-    names = {_place(f.path, f.camera): f.bands[0].name for f in of_path.values() if len(f.bands) == 1}
-    by_camera: dict[Camera, dict[tuple[Path, str], list[Path]]] = {}
+    names = {_place(f.path, f.camera): f.bands[0].name for f in files if len(f.bands) == 1}
+    cameras = {file.path: file.camera for file in files}
+    of_captures: dict[tuple[Camera, Path, str], list[Path]] = defaultdict(list)
+    for camera, file in product(set(cameras.values()), unreadable):
+        of_captures[camera, camera.capture_folder(file), camera.capture_name(file)].append(file)
     result = []
     for capture in captures:
         path = capture.reference.path
-        camera = of_path[path].camera
-        if camera not in by_camera:
-            by_camera[camera] = defaultdict(list)
-            for file in unreadable:
-                by_camera[camera][camera.capture_folder(file), camera.capture_name(file)].append(file)
-        of_capture = by_camera[camera].get((camera.capture_folder(path), camera.capture_name(path)), [])
+        camera = cameras[path]
+        of_capture = of_captures[camera, camera.capture_folder(path), camera.capture_name(path)]
         missing, reasons = {band_key(name): name for name in capture.missing_bands}, dict[str, Reason]()
         for file in of_capture if capture.has_several_files else ():
             without_tags = replace(capture.reference, name="", path=file, wavelength_nm=None)

@@ -81,6 +81,17 @@ class ImageFile:
         return self.camera.name_end(self.path)
 
     @property
+    def capture_id(self) -> str:
+        """The id of its capture in the tags; empty without one."""
+        return self.tags.first_text(self.camera.capture_ids)
+
+    @property
+    def unit(self) -> tuple[str, ...]:
+        """Its camera: make, model and serial number; the folder of the capture without a serial number."""
+        serial = self.tags.serial or str(self.camera.capture_folder(self.path))
+        return self.camera.name, self.tags.make, self.tags.model, serial
+
+    @property
     def is_whole_capture(self) -> bool:
         """True for a file of several bands with a lens each."""
         return len(self.bands) > 1 and not self.bands[0].one_lens
