@@ -12,12 +12,11 @@ colour photograph. The bands are exposed one after another, so in motion a seed 
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -69,14 +68,7 @@ class Dji(Camera):
         if len(stored) > 1:
             return colour_bands(stored, lens, None if is_mavic else by_centres)
         band = pix4d.described(stored[0], tags, tags.text(NAMESPACE, "BandName") or _band_in_name(path))
-        factors = _Factors.of(tags)
-        band = replace(
-            band,
-            lens=lens,
-            radiometry=_radiometry(factors, tags, stored[0]),
-            missing_calibration=factors.problem,
-            implausible=factors.problem_of_sun,
-        )
+        band = replace(_with_radiometry(band, tags), lens=lens)
         if calibrated is None or lens is None:
             return (replace(band, to_rig=by_centres),)
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)
@@ -146,59 +138,36 @@ def _height_m(tags: Tags) -> float | None:
     return height_m if height_m and height_m > 0 else None
 
 
-class _Factors(NamedTuple):
-    """What the radiometry of a file depends on; firmware writes most of it in two tags."""
+def _factors(tags: Tags) -> tuple[dict[str, float], list[str]]:
+    """({name of DJI's tag: value in its unit}, names of tags that others contradict): what the radiometry of a file
+    depends on. Firmware writes most of it in two tags; a value of 0 is missing, except the black level.
+    """
+    of_dji, of_pix4d = partial(tags.number, NAMESPACE), partial(tags.number, pix4d.NAMESPACE)
+    exif_s = finite(tags.exif.get("ExposureTime"))
+    sources = {
+        "SensorGain": (of_dji("SensorGain"),),
+        "ExposureTime": (of_dji("ExposureTime"), None if exif_s is None else exif_s * 1e6),  # microseconds
+        "BlackLevel": (of_dji("BlackLevel"), of_pix4d("BlackCurrent"), tags.black_level),
+        "SensorGainAdjustment": (of_dji("SensorGainAdjustment"), of_pix4d("RadiometricCalibration")),
+        "Irradiance": (of_dji("Irradiance"), of_pix4d("Irradiance"), of_pix4d("SunSensor")),
+    }
+    found = {k: agreed(v if v or k == "BlackLevel" else None for v in values) for k, values in sources.items()}
+    known = {name: value for name, (value, _) in found.items() if value is not None}
+    return known, [name for name, (_, is_agreed) in found.items() if not is_agreed]
 
-    of_tags: Mapping[str, float]
-    """By the name of DJI's tag, in its unit; only those that are known."""
-    centre_px: tuple[float, float]
-    vignetting: tuple[float, ...]
-    """k1 ... k6; empty if it is missing."""
-    contradicted: tuple[str, ...]
-    """Names of the tags that others contradict."""
 
-    @classmethod
-    def of(cls, tags: Tags) -> Self:
-        """Read the tags of a file; a value of 0 is missing, except the black level."""
-        of_dji, of_pix4d = partial(tags.number, NAMESPACE), partial(tags.number, pix4d.NAMESPACE)
-        exif_s = finite(tags.exif.get("ExposureTime"))
-        sources = {
-            "SensorGain": (of_dji("SensorGain"),),
-            "ExposureTime": (of_dji("ExposureTime"), None if exif_s is None else exif_s * 1e6),  # microseconds
-            "BlackLevel": (of_dji("BlackLevel"), of_pix4d("BlackCurrent"), tags.black_level),
-            "SensorGainAdjustment": (of_dji("SensorGainAdjustment"), of_pix4d("RadiometricCalibration")),
-            "Irradiance": (of_dji("Irradiance"), of_pix4d("Irradiance"), of_pix4d("SunSensor")),
-        }
-        found = {k: agreed(v if v or k == "BlackLevel" else None for v in values) for k, values in sources.items()}
-        centre_px, coefficients = pair(tags, "CalibratedOpticalCenter"), tags.numbers(NAMESPACE, "VignettingData", 6)
-        other_px, others = pix4d.vignetting(tags)
-        is_own = centre_px is not None and any(coefficients)
-        contradicted = [name for name, (_, is_agreed) in found.items() if not is_agreed]
-        if is_own and others and not _agree(coefficients, others):
-            contradicted.append("VignettingData")
-        if is_own and others and centre_px is not None and math.dist(centre_px, other_px) > _MAX_CENTRES_APART_PX:
-            contradicted.append("CalibratedOpticalCenter")
-        return cls(
-            {name: value for name, (value, _) in found.items() if value is not None},
-            centre_px if centre_px is not None and is_own else other_px,
-            coefficients if is_own else others,
-            tuple(contradicted),
-        )
-
-    @property
-    def problem(self) -> str:
-        """Why the file has no radiance, in words; empty if it has one."""
-        missing = [name for name in ("SensorGain", "ExposureTime", "BlackLevel") if name not in self.of_tags]
-        wrong = [name for name in self.contradicted if name != "Irradiance"]
-        if missing:
-            return f"no tag {', '.join(missing)} for radiance"
-        contradiction = f"other tags contradict {', '.join(wrong)}"
-        return f"no usable tags for radiance ({contradiction})" if wrong else ""
-
-    @property
-    def problem_of_sun(self) -> str:
-        """Why the irradiance is not used although the file has one; empty if it is, or the file has none."""
-        return "other tags contradict Irradiance" if "Irradiance" in self.contradicted else ""
+def _vignetting(tags: Tags) -> tuple[tuple[float, float], tuple[float, ...], list[str]]:
+    """(centre, k1 ... k6, names of tags that others contradict); no k if they are missing."""
+    centre_px, coefficients = pair(tags, "CalibratedOpticalCenter"), tags.numbers(NAMESPACE, "VignettingData", 6)
+    other_px, others = pix4d.vignetting(tags)
+    if centre_px is None or not any(coefficients):
+        return other_px, others, []
+    contradicted = []
+    if others and not _agree(coefficients, others):
+        contradicted.append("VignettingData")
+    if others and math.dist(centre_px, other_px) > _MAX_CENTRES_APART_PX:
+        contradicted.append("CalibratedOpticalCenter")
+    return centre_px, coefficients, contradicted
 
 
 def _agree(one: Sequence[float], other: Sequence[float]) -> bool:
@@ -206,34 +175,42 @@ def _agree(one: Sequence[float], other: Sequence[float]) -> bool:
     return len(one) == len(other) and all(agreed(two)[1] for two in zip(one, other, strict=True))
 
 
-def _radiometry(factors: _Factors, tags: Tags, stored: Band) -> Radiometry | None:
-    """The signal is (raw - black) / 2^bits (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
+def _with_radiometry(band: Band, tags: Tags) -> Band:
+    """The band with the calibration in its tags, or with what they lack or have in two ways.
+
+    The signal is (raw - black) / 2^bits (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
     SensorGainAdjustment / Irradiance is proportional to reflectance, with the same factor for all bands.
     """
-    if factors.problem:
-        return None
-    known = factors.of_tags
+    (known, contradicted), (centre_px, vignetting, of_vignetting) = _factors(tags), _vignetting(tags)
+    is_sun_known = "Irradiance" not in contradicted
+    band = replace(band, implausible="" if is_sun_known else "other tags contradict Irradiance")
+    if missing := [name for name in ("SensorGain", "ExposureTime", "BlackLevel") if name not in known]:
+        return replace(band, missing_calibration=f"no tag {', '.join(missing)} for radiance")
+    if wrong := [name for name in (*contradicted, *of_vignetting) if name != "Irradiance"]:
+        why = f"other tags contradict {', '.join(wrong)}"
+        return replace(band, missing_calibration=f"no usable tags for radiance ({why})")
     gain, exposure_s, adjusted = known["SensorGain"], known["ExposureTime"] / 1e6, known.get("SensorGainAdjustment")
     irradiance = known.get("Irradiance", 0.0)  # 0 without a reading
     by_sun = None
-    if irradiance > 0 and not factors.problem_of_sun:
+    if irradiance > 0 and is_sun_known:
         by_sun = ReflectanceFactor(1 / irradiance, "relative reflectance", errors=(LIGHT_SENSOR[2], REPEATABILITY))
-    missing = [] if factors.vignetting else [NO_VIGNETTING["DJI"]]
-    missing += [] if adjusted else [NO_GAIN_ADJUSTMENT]
-    return Radiometry(
+    lacking = [] if vignetting else [NO_VIGNETTING["DJI"]]
+    lacking += [] if adjusted else [NO_GAIN_ADJUSTMENT]
+    radiometry = Radiometry(
         "relative radiance",
         known["BlackLevel"],
-        full_scale(stored),
+        full_scale(band),
         (adjusted or 1.0) / (gain * exposure_s),
-        factors.centre_px,
-        factors.vignetting,
+        centre_px,
+        vignetting,
         vignetting_divides=False,
         by_sun=by_sun,
-        raw_step=raw_step_of(tags, stored),
+        raw_step=raw_step_of(tags, band),
         tags={"sensor gain": gain, "gain adjustment": adjusted or 1.0, "exposure time (s)": exposure_s}
         | ({"relative irradiance": irradiance} if irradiance else {}),
-        errors=(FACTORY_CALIBRATION, *missing),
+        errors=(FACTORY_CALIBRATION, *lacking),
     )
+    return replace(band, radiometry=radiometry)
 
 
 def _is_mavic_3(tags: Tags) -> bool:
