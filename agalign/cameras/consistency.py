@@ -106,8 +106,9 @@ def with_position(tags: Tags, other: Position | None, by_tags: Sun | None) -> tu
 # ---- size of the image and of the camera
 
 
-def pixel_scale(tags: Tags, band: Band, is_raw: Callable[[], bool]) -> PixelScale | None:
-    """Return the size of an image relative to that which its tags in pixels are for; None if it is a part of it.
+def pixel_scale(tags: Tags, band: Band, is_raw: Callable[[], bool]) -> tuple[PixelScale, str]:
+    """Return the size of an image relative to that which its tags in pixels are for, and why these tags are not used:
+    it is a part of that image; empty if they are.
 
     A program that resizes or crops images may leave the tags as they are. Both can keep the ratio of the sides;
     `is_raw` tells whether the pixels still have the steps of a sensor, which averaging removes.
@@ -115,20 +116,24 @@ def pixel_scale(tags: Tags, band: Band, is_raw: Callable[[], bool]) -> PixelScal
     centre_px = optical_centre_px(band)
     camera_px = _camera_size_px(tags, band.size_px, centre_px)
     if camera_px is None or camera_px == band.size_px:
-        return SAME_PIXELS
+        return SAME_PIXELS, ""
     scale = PixelScale.between(camera_px, band.size_px)
     is_of_one_ratio = abs(scale.x - scale.y) * max(band.size_px) < 2 * max(scale)  # sides of whole pixels
     if centre_px is None or not _is_near_middle(centre_px, camera_px):
-        return scale if is_of_one_ratio and tags.camera_size_px else SAME_PIXELS
-    return scale if is_of_one_ratio and not is_raw() else None
+        return scale if is_of_one_ratio and tags.camera_size_px else SAME_PIXELS, ""
+    if is_of_one_ratio and not is_raw():
+        return scale, ""
+    width, height = camera_px
+    return SAME_PIXELS, f"{lens_of_other_image(band)}, cropped or reduced from {width} x {height} px"
 
 
 def optical_centre_px(band: Band) -> tuple[float, float] | None:
     """Return the optical centre of a band's image by its lens, else by its vignetting; None if both are unknown."""
     if band.lens is not None:
         return band.lens.cx_px, band.lens.cy_px
-    has_vignetting = band.radiometry is not None and any(band.radiometry.vignetting)
-    return band.radiometry.vignetting_centre_px if band.radiometry is not None and has_vignetting else None
+    if band.radiometry is not None and any(band.radiometry.vignetting):
+        return band.radiometry.vignetting_centre_px
+    return None
 
 
 def lens_of_other_image(band: Band) -> str:
@@ -150,12 +155,6 @@ def vignetting_of_other_lens(band: Band) -> str:
     apart_px = math.hypot(x - lens.cx_px, y - lens.cy_px)
     is_apart = apart_px > max_apart * max(band.size_px)
     return f"the vignetting has its centre {apart_px:.0f} px from the optical centre of the lens" if is_apart else ""
-
-
-def part_of_image(tags: Tags, band: Band) -> str:
-    """Return the same of an image that is a part of the one that its tags are for."""
-    width, height = _camera_size_px(tags, band.size_px, optical_centre_px(band)) or band.size_px
-    return f"{lens_of_other_image(band)}, cropped or reduced from {width} x {height} px"
 
 
 def _camera_size_px(tags: Tags, size_px: Size, centre_px: tuple[float, float] | None) -> Size | None:

@@ -132,18 +132,9 @@ def _of_image(band: Band, tags: Tags, raw_step: int) -> tuple[Band, PixelScale, 
     """Return the band with what its tags give in pixels as it is for its image, the size of this relative to the
     camera's, and why these tags are not used; empty if they are. Raw numbers are multiples of `raw_step`.
     """
-    scale = consistency.pixel_scale(tags, band, lambda: band.dtype == "uint16" and value_step(band) % raw_step == 0)
-    if scale is None:
-        why = consistency.part_of_image(tags, band)
-        return _without_lens(band, why), SAME_PIXELS, why
-    result, why = _with_lens_of_image(band, scale)
-    return result, scale, why
-
-
-def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
-    """Return the band with what its tags give in pixels of the camera's image rescaled to the image; without it, and
-    why, if the lens is then not that of the image, as of images that a program resized or cropped.
-    """
+    scale, why = consistency.pixel_scale(
+        tags, band, lambda: band.dtype == "uint16" and value_step(band) % raw_step == 0
+    )
     if scale != SAME_PIXELS:
         planes = band.to_rig, band.other_to_rig
         to_rig, other = (None if h is None else geometry.rescale(h, scale, SAME_PIXELS) for h in planes)
@@ -152,10 +143,9 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
         band = replace(
             band, lens=rescaled(band.lens, scale), to_rig=to_rig, other_to_rig=other, radiometry=radiometry, panel=panel
         )
-    if band.lens is None or band.lens.is_plausible(band.size_px):
-        return band, ""
-    why = consistency.lens_of_other_image(band)
-    return _without_lens(band, why), why
+    if not why and band.lens is not None and not band.lens.is_plausible(band.size_px):
+        why = consistency.lens_of_other_image(band)
+    return _without_lens(band, why) if why else band, scale, why
 
 
 def _without_lens(band: Band, why: str) -> Band:

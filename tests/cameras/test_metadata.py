@@ -195,7 +195,9 @@ def test_the_area_of_a_panel_in_tags_follows_the_size_of_the_image(flight: Path)
     corners = ((100.0, 80.0), (140.0, 80.0), (140.0, 120.0), (100.0, 120.0))
     band = replace(discover(flight).captures[0].bands[0], panel=Panel("tags", albedo=0.5, corners_px=corners))
     half, small = PixelScale(0.5, 0.5), replace(band, width_px=band.width_px // 2, height_px=band.height_px // 2)
-    reduced, _ = read_files._with_lens_of_image(small, half)
+    of_camera = Tags(exif={"ExifImageWidth": band.width_px, "ExifImageHeight": band.height_px})
+    reduced, scale, _ = read_files._of_image(small, of_camera, raw_step=1 << 16)
+    assert scale == half
     np.testing.assert_allclose(reduced.panel.corners_px, half.positions(corners))
     assert read_files._without_lens(band, "cropped").panel == Panel("tags", albedo=0.5)
 

@@ -20,7 +20,7 @@ from agalign.batch import capture_task as batch
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, focal_length_px
-from agalign.cameras.read_files import _with_lens_of_image
+from agalign.cameras.read_files import _of_image
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.host.files import INDICES_FILE, PANELS_FILE, RUN_FILE, SKY_FILE, write_csv
@@ -31,7 +31,6 @@ from agalign.records.sidecar_file import find_sidecars
 from agalign.spectral_indices.indices_csv import read_table
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
-from agalign.values.pixel_units import SAME_PIXELS
 
 from ..conftest import Shared, raising, read_json, seeded
 from ..program import agalign_here
@@ -91,7 +90,7 @@ def test_tags_have_no_character_that_changes_other_text() -> None:
 def test_a_lens_of_damaged_tags_is_not_used(flight: Path, change: dict[str, Any]) -> None:
     """Mappings by it are not finite, and cannot be written."""
     band = discover(flight).captures[0].bands[2]
-    result, why = _with_lens_of_image(replace(band, lens=replace(band.lens, **change)), SAME_PIXELS)
+    result, _, why = _of_image(replace(band, lens=replace(band.lens, **change)), Tags(), 1)
     assert (result.lens is None, result.to_rig is None, bool(why)) == (bool(change),) * 3
 
 
