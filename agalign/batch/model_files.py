@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from agalign.flight.groups import model_names
+from agalign.flight.groups import model_name
 from agalign.host.files import MODELS_FOLDER
 from agalign.host.own_files import is_own_file
 from agalign.records.cautions import models_in
@@ -37,4 +37,4 @@ class ModelFiles:
 
     def _paths(self, captures: Sequence[Capture]) -> list[Path]:
         """Return possible names of the model of a flight; at least one is free."""
-        return [self._folder / name for name in model_names([captures] * (len(self._taken) + 1))]
+        return [self._folder / model_name(captures[0], number) for number in range(1, len(self._taken) + 2)]

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import count
 from statistics import median, mode
 from typing import Self
 
@@ -100,18 +99,10 @@ def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
     return flights
 
 
-def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
-    """Return a unique file name for the model of each group: the camera, with a number if it occurs again."""
-    names: list[str] = []
-    used: set[str] = set()
-    for group in groups:
-        camera = group[0].camera
-        stem = file_name(f"{camera.model} {camera.unit}".strip() or "camera")
-        numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
-        name = next(n for n in numbered if n.lower() not in used)
-        used.add(name.lower())
-        names.append(f"{name}.safetensors")
-    return names
+def model_name(capture: Capture, number: int = 1) -> str:
+    """Return the file name of a model of a capture's camera; further models of the camera have a `number` from 2 on."""
+    stem = file_name(f"{capture.camera.model} {capture.camera.unit}".strip() or "camera")
+    return f"{stem}.safetensors" if number == 1 else f"{stem}-{number}.safetensors"
 
 
 @dataclass(frozen=True)

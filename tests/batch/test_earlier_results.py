@@ -21,7 +21,7 @@ from agalign.batch.workers import RunTasks, open_workers
 from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
-from agalign.flight.groups import model_names
+from agalign.flight.groups import model_name
 from agalign.records.sidecar_file import find_sidecars, read_checked, read_sidecar, write_sidecar
 from agalign.values.image import OutputGrid
 
@@ -214,8 +214,7 @@ def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp
 def test_finished_captures_get_the_crop_of_a_new_rig(flight: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are known once the rig is, and are rendered by as many workers as others."""
     scan, said, opened = agalign.discover(flight), [], []
-    (name,) = model_names([scan.captures])
-    save_known_model(out / "models" / name, fingerprint="of the flight")
+    save_known_model(out / "models" / model_name(scan.captures[0]), fingerprint="of the flight")
     for path in find_sidecars(out):
         write_sidecar(path, read_sidecar(path).model_copy(update={"model": "of the flight"}))
 

@@ -16,12 +16,13 @@ import agalign
 from agalign.batch import flight_learning as batch_learn
 from agalign.batch import learning_tasks
 from agalign.batch.capture_report import CaptureReport
+from agalign.batch.model_files import ModelFiles
 from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
 from agalign.batch.workers import Completed
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions
 from agalign.flight.fingerprint import learning_fingerprint
-from agalign.flight.groups import camera_key, flights_of, model_names
+from agalign.flight.groups import camera_key, flights_of
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.rig import MIN_CAPTURES
 from agalign.flight.rig_file import read_rig
@@ -165,7 +166,9 @@ def test_a_lost_model_is_learned_again_for_captures_that_are_rendered(
     assert load_model(path, cpu).camera is not None
 
 
-def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_own(flight: Path) -> None:
+def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_own(
+    flight: Path, tmp_path: Path
+) -> None:
     one, two = agalign.discover(flight).captures
 
     def of(capture: Capture, flight_id: str = "", **camera: str) -> Capture:
@@ -178,7 +181,11 @@ def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_
     cameras = [[of(one, model=model, serial="")] for model in ("X", "X", "X-2", "x")]
     stem = "RedEdge-M_SY01-0000001-AG"
     names = stem, "RedEdge-M_X9", f"{stem}-2", f"{stem}-3", "X", "X-2", "X-2-2", "x-3"
-    assert model_names([*groups, [later], *cameras]) == [f"{name}.safetensors" for name in names]
+    models = ModelFiles(tmp_path)
+    for group, name in zip([*groups, [later], *cameras], names, strict=True):
+        path = models.new(group)
+        models.add(path, "")
+        assert path.name == f"{name}.safetensors"
     smaller = tuple(replace(b, width_px=100) if b.name == "NIR" else b for b in two.bands)
     assert len(flights_of([one, replace(two, bands=smaller)])) == 2
     without = tuple(b for b in two.bands if b.name != "NIR")

@@ -16,11 +16,11 @@ from synthetic_flights.aligned import make_aligned
 import agalign
 from agalign.batch import capture_task
 from agalign.batch.index_run import index_tasks, run_indices
+from agalign.batch.model_files import ModelFiles
 from agalign.batch.output_files import remove_outputs
 from agalign.batch.run import run_flight
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.exports.programs import export
-from agalign.flight.groups import model_names
 from agalign.host.files import file_name
 from agalign.host.text import without_controls
 from agalign.records.sidecar_file import file_part, find_sidecars
@@ -112,16 +112,20 @@ def test_a_run_writes_plain_names_inside(hostile_run: Path) -> None:
     assert all(p.is_relative_to(hostile_run / "deep" / "er" / "out") and is_plain(p.name) for p in written)
 
 
-def test_names_of_files_are_plain_and_different() -> None:
+def test_names_of_files_are_plain_and_different(tmp_path: Path) -> None:
     taken: dict[str, str] = {}
     names, again = ([file_name(text, taken) for text in (*HOSTILE, "A", "a", "a_b")] for _ in range(2))
     assert len({name.lower() for name in names}) == len(names)
     assert names == again
     expected = {"IMG_0001_2.tif": "IMG_0001_2.tif", "nul.TIF": "_nul.TIF", "x" * 300 + ".tif": "x" * 120 + ".tif"}
     assert {text: file_name(text) for text in expected} == expected
-    models = model_names([[Capture("x", Path(), (), 0, CameraIdentity("", "", t))] for t in (*HOSTILE, *HOSTILE)])
-    assert len(set(models)) == len(models)
-    assert all(map(is_plain, (*names, *models)))
+    models = ModelFiles(tmp_path)
+    for serial in (*HOSTILE, *HOSTILE):
+        path = models.new([Capture("x", Path(), (), 0, CameraIdentity("", "", serial))])
+        assert path.name not in names
+        models.add(path, "")
+        names.append(path.name)
+    assert all(map(is_plain, names))
 
 
 def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
