@@ -37,6 +37,8 @@ _AROUND, _MAX_SPEED_KM_S = 2, 0.1
 """Captures before and after one, and the speed of a light aircraft."""
 _GPS_ROLLOVER_H = 1024 * 7 * 24.0
 """Hours after which the week number of GPS repeats."""
+_CLOCK_ERRORS_H = (*sorted((quarters / 4 for quarters in range(-96, 97)), key=abs), _GPS_ROLLOVER_H, -_GPS_ROLLOVER_H)
+"""Hours by which a clock may be behind, as they are tried; time zones differ by quarters of an hour."""
 _MAX_OFF_CENTRE = 0.1
 """Distance of the optical centre from the middle of the camera's image, relative to its longer side; cameras have up to
 0.08.
@@ -57,19 +59,15 @@ def clock_error(position: Position | None, captured_at: str, by_tags: Sun | None
     def error(later_h: float) -> float:
         return by_tags.angle_to(sun_position(position, time_s + 3600 * later_h))
 
-    if error(0.0) < _MAX_SUN_ERROR:
+    later_h = next((h for h in _CLOCK_ERRORS_H if error(h) < _MAX_SUN_ERROR), None)
+    if later_h == 0:
         return ""
-    steps_per_hour, max_hours = 4, 24  # time zones differ by quarters of an hour
-    near_first = sorted(range(-max_hours * steps_per_hour, max_hours * steps_per_hour + 1), key=abs)
-    fits = (h for step in near_first if error(h := step / steps_per_hour) < _MAX_SUN_ERROR)
-    if (later_h := next(fits, None)) is not None:
-        return f"is about {abs(later_h):g} hours {'behind' if later_h > 0 else 'ahead'}"
-    for later_h, way in ((_GPS_ROLLOVER_H, "behind"), (-_GPS_ROLLOVER_H, "ahead")):
-        if error(later_h) < _MAX_SUN_ERROR:
-            return (
-                f"is about {_GPS_ROLLOVER_H:,.0f} hours {way} (1024 weeks, after which the week number of GPS repeats)"
-            )
-    return "is wrong by hours or months"
+    if later_h is None:
+        return "is wrong by hours or months"
+    way = "behind" if later_h > 0 else "ahead"
+    if abs(later_h) == _GPS_ROLLOVER_H:
+        return f"is about {abs(later_h):,.0f} hours {way} (1024 weeks, after which the week number of GPS repeats)"
+    return f"is about {abs(later_h):g} hours {way}"
 
 
 # ---- position
