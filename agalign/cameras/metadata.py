@@ -111,15 +111,13 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))
     )
     orientation, packet = first.get("Orientation", 1), Packet.parse(first.get("XMLPacket", b""))
-    by_xmp, (position, to_a_minute, without_signs) = Tags(xmp=packet.values()), _positions(gps)
+    by_xmp = Tags(xmp=packet.values())
     return replace(
         by_xmp,
         make=_text(first.get("Make")),
         model=_text(first.get("Model")),
         serial=_text(exif.get("BodySerialNumber")) or by_xmp.first_text(_SERIAL_NUMBERS),
-        position=position,
-        position_to_a_minute=to_a_minute,
-        without_signs=without_signs,
+        **_position(gps),
         captured_at=_iso_time(exif, "DateTimeOriginal", "OffsetTimeOriginal")
         or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
@@ -144,23 +142,19 @@ def _size(directory: Mapping[str, Any], *sides: str) -> tuple[int, int] | None:
     return (width, height) if isinstance(width, int) and isinstance(height, int) and width > 0 < height else None
 
 
-def _positions(gps: Mapping[str, Any]) -> tuple[Position | None, Position | None, Position | None]:
-    """(position, position to a minute, position without signs) of `Tags`, at most one of which is known; none without a
-    fix, for which cameras write no coordinates or zeros.
-    """
+def _position(gps: Mapping[str, Any]) -> dict[str, Any]:
+    """{name of the field of `Tags`: position}; empty without a fix, for which cameras write no coordinates or zeros."""
     (latitude_deg, is_exact), (longitude_deg, is_exact_too) = _degrees(gps, "Latitude"), _degrees(gps, "Longitude")
     # A coordinate of exactly 0 is a missing one: receivers resolve 0.01 m.
-    if not latitude_deg or not longitude_deg:
-        return None, None, None
-    if latitude_deg > 90.0 or longitude_deg > 180.0:
-        return None, None, None
+    if not latitude_deg or not longitude_deg or latitude_deg > 90.0 or longitude_deg > 180.0:
+        return {}
     is_exact &= is_exact_too
     absolute = Position(latitude_deg, longitude_deg, _altitude_m(gps))
     sign, other = _sign(gps, "Latitude", "NS"), _sign(gps, "Longitude", "EW")
     if sign is None or other is None:
-        return None, None, absolute if is_exact else None
+        return {"without_signs": absolute} if is_exact else {}
     signed = Position(sign * latitude_deg, other * longitude_deg, absolute.altitude_m)
-    return (signed, None, None) if is_exact else (None, signed, None)
+    return {"position" if is_exact else "position_to_a_minute": signed}
 
 
 def _degrees(gps: Mapping[str, Any], axis: str) -> tuple[float | None, bool]:
