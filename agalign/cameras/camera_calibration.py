@@ -61,8 +61,8 @@ def _without_incomplete(band: Band, of_radiance: frozenset[str], of_sun: frozens
     return band
 
 
-def different_calibrations(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for each kind of factor that differs between files of one band of a camera, or a black level
+def different_calibrations(files: Sequence[ImageFile]) -> Iterator[Problem]:
+    """Yield a problem for each kind of factor that differs between files of one band of a camera, or a black level
     that differs between its bands: one of them has the tags of another camera.
     """
     factors: dict[tuple[object, str, str], list[tuple[float, ImageFile]]] = defaultdict(list)
@@ -70,7 +70,6 @@ def different_calibrations(files: Sequence[ImageFile]) -> list[Problem]:
         for what, value in _constants(file.bands[0]):
             band = "" if what == "black level" else band_key(file.bands[0].name)
             factors[file.unit, what, band].append((value, file))
-    problems = []
     for (_, what, _), found in factors.items():
         usual, count = Counter(value for value, _ in found).most_common(1)[0]
         others = [(value, f) for value, f in found if abs(value - usual) > _SAME * abs(usual)]
@@ -78,8 +77,7 @@ def different_calibrations(files: Sequence[ImageFile]) -> list[Problem]:
             value, file = others[0]
             rest = f", and in {counted(len(others) - 1, 'other file')}" if len(others) > 1 else ""
             text = f"the {what} in its tags is {value:g}{rest}; {counted(count, 'file')} of the camera have {usual:g}"
-            problems.append(problem_of(file.path, f"{text}; correct the tags", is_harmless=True))
-    return problems
+            yield problem_of(file.path, f"{text}; correct the tags", is_harmless=True)
 
 
 def _constants(band: Band) -> Iterator[tuple[str, float]]:

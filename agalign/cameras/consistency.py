@@ -7,7 +7,7 @@ are compared with the tags by `pixels.radiometry.with_checked_pixels`.
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import timedelta
 from itertools import pairwise, product
@@ -206,31 +206,27 @@ def normalized(tags: Tags) -> str:
 # ---- what several files say
 
 
-def doubtful_files(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for each kind of doubt, which names the first file with it."""
+def doubtful_files(files: Sequence[ImageFile]) -> Iterator[Problem]:
+    """Yield a problem for each kind of doubt, which names the first file with it."""
     by_advice: dict[str, list[tuple[ImageFile, str]]] = defaultdict(list)
     for file in files:
         for doubt in file.doubts:
             by_advice[doubt.advice].append((file, doubt.text))
-    problems = []
     for advice, found in by_advice.items():
         (file, text), *rest = found
         others = f", and so in {counted(len(rest), 'other file')}" if rest else ""
-        problems.append(problem_of(file.path, f"{text}{others}; {advice}", is_harmless=True))
-    return problems
+        yield problem_of(file.path, f"{text}{others}; {advice}", is_harmless=True)
 
 
-def list_problems(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for each multiband file with tags that list another number of names or wavelengths."""
-    problems = []
+def list_problems(files: Sequence[ImageFile]) -> Iterator[Problem]:
+    """Yield a problem for each multiband file with tags that list another number of names or wavelengths."""
     for file in files:
         names, wavelengths = len(listed_names(file.tags)), len(file.tags.numbers(NAMESPACE, "CentralWavelength"))
         bands = len(file.bands)
         if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
             counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
             text = f"has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
-            problems.append(problem_of(file.path, text, is_harmless=True))
-    return problems
+            yield problem_of(file.path, text, is_harmless=True)
 
 
 def _position(file: ImageFile) -> str:
@@ -239,8 +235,8 @@ def _position(file: ImageFile) -> str:
     return f"RigCameraIndex {index}" if index else f"'{end}' at the end of the name" if end else ""
 
 
-def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
-    """Return a problem for each position in the rig of one camera that changes its tags, and for bands with a name or
+def contradictions(groups: Iterable[Sequence[ImageFile]]) -> Iterator[Problem]:
+    """Yield a problem for each position in the rig of one camera that changes its tags, and for bands with a name or
     wavelength that others contradict. `groups` are the files of each capture.
     """
     tags: dict[tuple[object, str], dict[str, list[ImageFile]]] = defaultdict(lambda: defaultdict(list))
@@ -252,7 +248,8 @@ def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
                 tags[file.unit, position][label].append(file)
         for text, path in _doubtful([b for file in group for b in file.bands if not b.is_from_photograph]):
             doubtful[text].append(path)
-    texts = [(p[0], f"{text}, in {counted(len(p), 'file')}; correct the tags") for text, p in doubtful.items()]
+    for text, paths in doubtful.items():
+        yield problem_of(paths[0], f"{text}, in {counted(len(paths), 'file')}; correct the tags")
     for (_, position), by_label in tags.items():
         bands = [files[0].bands[0] for files in by_label.values()]
         wavelengths = [b.wavelength_nm for b in bands if b.wavelength_nm is not None]
@@ -262,12 +259,11 @@ def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
             what = " and ".join(f"{label} in {some_of(dict.fromkeys(names))}" for label, names in captures.items())
             advice = "one of the names is wrong: compare the images and correct the tags"
             path = [*by_label.values()][-1][0].path
-            texts.append((path, f"files with {position} of one camera are {what}; {advice}"))
-    return [problem_of(path, text) for path, text in texts]
+            yield problem_of(path, f"files with {position} of one camera are {what}; {advice}")
 
 
-def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
-    """Return a problem for each band that captures have from two files, as of different naming: f_red.tif and
+def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> Iterator[Problem]:
+    """Yield a problem for each band that captures have from two files, as of different naming: f_red.tif and
     red/f_red.tif. `groups` are the files of each capture; bands of one name and other wavelengths are two bands.
     """
     clashes: dict[str, list[tuple[Path, Path]]] = defaultdict(list)
@@ -278,51 +274,48 @@ def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
             nms = [b.wavelength_nm for b in (*other.bands, *file.bands) if b.wavelength_nm is not None]
             if other is not file and max(nms, default=0.0) - min(nms, default=0.0) <= SAME_BAND_NM:
                 clashes[file.bands[0].name].append((other.path, file.path))
-    problems = []
     for name, pairs in clashes.items():
         other_path, path = pairs[0]
         others = f", and so in {counted(len(pairs) - 1, 'other file')}" if len(pairs) > 1 else ""
         twin = other_path.name if other_path.name != path.name else other_path
         text = f"is band '{name}' of one capture as {twin} is{others}; both are aligned: move one of them elsewhere"
-        problems.append(problem_of(path, text))
-    return problems
+        yield problem_of(path, text)
 
 
-def _doubtful(bands: Sequence[Band]) -> list[tuple[str, Path]]:
-    """(what contradicts, file) of the bands of a capture."""
+def _doubtful(bands: Sequence[Band]) -> Iterator[tuple[str, Path]]:
+    """Yield (what contradicts, file) of the bands of a capture."""
     known = sorted(((b, b.wavelength_nm) for b in bands if b.wavelength_nm is not None), key=lambda pair: pair[1])
-    wrong = ((b, nm) for b, nm in known if contradicts(b.name, nm))
-    text = "the name '{}' contradicts its wavelength of {:g} nm, so that no index uses it"
-    result = [(text.format(band.name, nm), band.path) for band, nm in wrong]
+    for band, nm in known:
+        if contradicts(band.name, nm):
+            yield f"the name '{band.name}' contradicts its wavelength of {nm:g} nm, so that no index uses it", band.path
     for (one, nm), (other, other_nm) in pairwise(known):
         if other_nm - nm < _SAME_NM and band_key(one.name) != band_key(other.name):
-            text = f"the bands {one.name} and {other.name} of a capture have one wavelength, {nm:g} nm"
-            result.append((text, other.path))
-    return result
+            yield f"the bands {one.name} and {other.name} of a capture have one wavelength, {nm:g} nm", other.path
 
 
-def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
-    """Return a problem for each file with the tags of a different capture: its position is far from that of the other
+def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> Iterator[Problem]:
+    """Yield a problem for each file with the tags of a different capture: its position is far from that of the other
     files of its capture, or only its serial number differs. `groups` are the files of each capture.
     """
-    found: list[tuple[ImageFile, str]] = []
+    advice = "correct the tags"
     for group in (g for g in groups if len(g) > 2):
         places = [(f, f.tags.position) for f in group if f.tags.position is not None]
         if places:
             latitude, longitude = (
                 median_low(getattr(p, axis) for _, p in places) for axis in ("latitude", "longitude")
             )
-            usual = Position(latitude, longitude)
-            far = [(f, km) for f, p in places if (km := distance_km(p, usual)) > _MAX_POSITION_ERROR_KM]
-            found += [(f, f"its position is {km:.0f} km from that of the other files of its capture") for f, km in far]
+            for file, place in places:
+                if (km := distance_km(place, Position(latitude, longitude))) > _MAX_POSITION_ERROR_KM:
+                    text = f"its position is {km:.0f} km from that of the other files of its capture; {advice}"
+                    yield problem_of(file.path, text, is_harmless=True)
         serials = Counter(f.tags.serial for f in group if f.tags.serial)
-        alone = [f for f in group if serials[f.tags.serial] == 1 < len(serials)]
-        found += [(f, f"its serial number {f.tags.serial} is not that of the other files") for f in alone]
-    return [problem_of(f.path, f"{text}; correct the tags", is_harmless=True) for f, text in found]
+        for file in (f for f in group if serials[f.tags.serial] == 1 < len(serials)):
+            text = f"its serial number {file.tags.serial} is not that of the other files; {advice}"
+            yield problem_of(file.path, text, is_harmless=True)
 
 
-def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
-    """Return a problem for the first capture of each camera whose position is too far from those of the captures around
+def far_from_flight(captures: Iterable[Capture]) -> Iterator[Problem]:
+    """Yield a problem for the first capture of each camera whose position is too far from those of the captures around
     it in time for any aircraft.
     """
     by_camera: dict[object, list[tuple[float, Position, Capture]]] = defaultdict(list)
@@ -330,7 +323,6 @@ def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
         time_s = known_time_s(capture.captured_at)
         if capture.position is not None and time_s is not None and capture.camera.unit:
             by_camera[capture.camera].append((time_s, capture.position, capture))
-    problems = []
     for flight in by_camera.values():
         flight.sort(key=lambda one: one[0])
         found: list[tuple[Capture, float]] = []
@@ -348,8 +340,7 @@ def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
             others = f", and so are {counted(len(rest), 'other capture')}" if rest else ""
             path = capture.reference.path
             text = f"its position is {km:.0f} km from those of the captures around it{others}; correct the tags"
-            problems.append(problem_of(path, text, is_harmless=True))
-    return problems
+            yield problem_of(path, text, is_harmless=True)
 
 
 # ---- number and time

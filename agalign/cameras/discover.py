@@ -4,6 +4,7 @@ of georeferenced mosaics.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -105,9 +106,10 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     files = with_complete_calibrations(with_one_spelling(grouping.with_bands_of_names(files)))
     captures: list[Capture] = []
     groups, copied = grouping.join_folders(grouping.group_files(files, with_rgb=options.with_rgb))
-    problems += copies + copied + damaged + consistency.list_problems(files) + consistency.doubtful_files(files)
-    problems += consistency.contradictions(groups) + consistency.exposed_apart(groups)
-    problems += different_calibrations(files) + consistency.of_other_captures(groups)
+    problems += copies + copied + damaged
+    problems += chain(consistency.list_problems(files), consistency.doubtful_files(files))
+    problems += chain(consistency.contradictions(groups), consistency.exposed_apart(groups))
+    problems += chain(different_calibrations(files), consistency.of_other_captures(groups))
     problems += consistency.files_of_one_band(groups) if options.pattern is None else []
     _check_bands(groups, options.bands, folder)
     for group in groups:

@@ -5,7 +5,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from filecmp import cmp as same_bytes
@@ -321,16 +321,14 @@ def _is_picture_band(file: ImageFile) -> bool:
     return file.camera.name == Generic.name and not _is_tiff(file) and not file.bands[0].is_from_photograph
 
 
-def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
-    """Return the files of one capture that a pattern assigns to the same band: it splits their names wrongly."""
+def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> Iterator[Problem]:
+    """Yield the files of one capture that a pattern assigns to the same band: it splits their names wrongly."""
     first: dict[str, Path] = {}
-    result = []
     for file in files:
         for name in {b.name for b in file.bands}:
             if first.setdefault(name, file.path) != file.path:
                 what = f"is band '{name}' of one capture with {first[name].name} by the pattern '{pattern}'"
-                result.append(problem_of(file.path, f"{what}; give one that distinguishes them"))
-    return result
+                yield problem_of(file.path, f"{what}; give one that distinguishes them")
 
 
 def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOptions) -> Capture:

@@ -401,7 +401,7 @@ def test_a_capture_far_from_its_flight_is_named(flight: Path, apart_s: float, de
         at = f"{np.datetime64('2024-06-01T12:00:00') + np.timedelta64(int(apart_s * k), 's')}+00:00"
         place = here if math.isfinite(here.latitude) else None
         captures.append(replace(first, bands=bands, position=place, captured_at=at))
-    problems = far_from_flight(captures)
+    problems = list(far_from_flight(captures))
     assert [int(p.path.stem) for p in problems] == found
     assert all("km from those of the captures around it; correct the tags" in p.text for p in problems)
 
