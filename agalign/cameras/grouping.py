@@ -32,7 +32,6 @@ from agalign.values.spectrum import band_key
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
-_CameraKey = tuple[str, ...]
 _LENS_CALIBRATION = (
     *names_in(pix4d.NAMESPACE, "PrincipalPoint PerspectiveDistortion RigRelatives FisheyePolynomial"),
     *names_in(dji.NAMESPACE, "DewarpData CalibratedHMatrix RelativeOpticalCenterX RelativeOpticalCenterY"),
@@ -423,21 +422,18 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     A multiband file has no missing bands. A capture of a dual camera without files of one half gets the serial numbers
     of both.
     """
-    cameras = _cameras(captures)
-    members: dict[_CameraKey, list[Capture]] = defaultdict(list)
-    for capture, camera in zip(captures, cameras, strict=True):
-        members[camera].append(capture)
-    bands = {camera: _camera_bands([c for c in some if c.has_several_files]) for camera, some in members.items()}
-    identities = {camera: {c.camera for c in of_camera} for camera, of_camera in members.items()}
-    result = []
-    for capture, camera in zip(captures, cameras, strict=True):
-        own = {band_key(b.name) for b in capture.bands}
-        of_camera = bands[camera] if capture.has_several_files else ()
-        of_flight = [b.name for b in of_camera if band_key(b.name) not in own]
-        missing = tuple({band_key(name): name for name in (*capture.missing_bands, *of_flight)}.values())
-        identity = _complete(capture.camera, identities[camera])
-        result.append(replace(capture, missing_bands=missing, camera_bands=of_camera, camera=identity))
-    return result
+    result: dict[str, Capture] = {}
+    for of_camera in _by_camera(captures):
+        identities = {c.camera for c in of_camera}
+        usual = _camera_bands([c for c in of_camera if c.has_several_files])
+        for capture in of_camera:
+            bands = usual if capture.has_several_files else ()
+            own = {band_key(b.name) for b in capture.bands}
+            lacking = [b.name for b in bands if band_key(b.name) not in own]
+            missing = tuple({band_key(name): name for name in (*capture.missing_bands, *lacking)}.values())
+            identity = _complete(capture.camera, identities)
+            result[capture.label] = replace(capture, missing_bands=missing, camera_bands=bands, camera=identity)
+    return [result[capture.label] for capture in captures]
 
 
 def with_unreadable_bands(
@@ -502,8 +498,8 @@ def usual_bands(captures: Sequence[Capture]) -> list[str]:
     return [name for name, n in counts.items() if 2 * n >= len(captures)]
 
 
-def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
-    """The camera of each capture: make, model and serial numbers, or the folder if no tag names a model.
+def _by_camera(captures: Sequence[Capture]) -> list[list[Capture]]:
+    """The captures of each camera: of a make, model and serial numbers, or of a folder if no tag names a model.
 
     Captures of one model that share a serial number are of one camera: a dual camera has two serial numbers, and a
     capture without files of one half has one of them. A capture without a serial number belongs to the only camera of
@@ -515,14 +511,14 @@ def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
         same_model = cameras[capture.camera.make, capture.camera.model]
         sharing = [known for known in same_model if known & own]
         if own:
-            same_model[:] = [known for known in same_model if not known & own] + [own.union(*sharing)]
-    keys: list[_CameraKey] = []
+            same_model[:] = [*(known for known in same_model if known not in sharing), own.union(*sharing)]
+    result: dict[object, list[Capture]] = defaultdict(list)
     for capture in captures:
         make, model, own = capture.camera.make, capture.camera.model, capture.camera.serials
         same_model = cameras[make, model]
         known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
-        keys.append((make, model, *sorted(known[0] if known else own)) if model else (capture.folder.as_posix(),))
-    return keys
+        result[(make, model, known[0] if known else own) if model else capture.folder].append(capture)
+    return list(result.values())
 
 
 def with_cameras_apart(captures: Sequence[Capture], groups: Sequence[Sequence[ImageFile]]) -> list[Capture]:
