@@ -65,9 +65,8 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
     scale = checked[0][1] if checked else SAME_PIXELS
     other_lens = next((why for *_, why in checked if why), "")
-    found = [doubt for doubt in (of_position, of_samples) if doubt is not None]
-    doubts = *found, *_doubts(camera, tags, bands, other_lens)
-    return ImageFile(path, camera, tags, bands, scale, bool(other_lens), doubts)
+    doubts = of_position, of_samples, *_doubts(camera, tags, bands, other_lens)
+    return ImageFile(path, camera, tags, bands, scale, bool(other_lens), tuple(d for d in doubts if d is not None))
 
 
 def _named_bands(path: Path, tags: Tags, camera: Camera, pages: Sequence[tuple[Band, ...]]) -> list[Band]:
