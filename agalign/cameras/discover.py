@@ -125,9 +125,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
             raise unknown_band
     captures = grouping.with_cameras_apart(captures, groups)
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
-    captures = grouping.with_missing_bands(
-        grouping.with_unique_capture_names(captures, grouping.band_file_owners(captures))
-    )
+    captures = grouping.with_unique_capture_names(captures, grouping.band_file_owners(captures))
+    captures = grouping.with_missing_bands(captures)
     captures = grouping.with_unreadable_bands(captures, files, problems)
     problems += consistency.far_from_flight(captures)
     return FolderScan(folder, tuple(captures), tuple(problems))
@@ -221,7 +220,7 @@ def mosaics_onto(
         captured_at = read_tags(path).captured_at
         unique, root = tuple(grouping.with_unique_band_names(bands)), reference.parent
         captures.append(Capture(path.stem, Path(), unique, 0, captured_at=captured_at, root=root))
-    return FolderScan(reference.parent, tuple(grouping.with_unique_capture_names(captures)), ())
+    return FolderScan(reference.parent, tuple(grouping.with_unique_capture_names(captures, {})), ())
 
 
 def mosaics_apart_km(fixed: Band, moving: Band) -> float:

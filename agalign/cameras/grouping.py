@@ -11,7 +11,6 @@ from datetime import timedelta
 from filecmp import cmp as same_bytes
 from itertools import count, product
 from pathlib import Path
-from types import MappingProxyType
 
 from agalign.cameras import dji, pix4d
 from agalign.cameras.base import Camera, colour_bands, reference_index
@@ -579,11 +578,9 @@ def band_file_owners(captures: Sequence[Capture]) -> dict[str, str]:
     }
 
 
-def with_unique_capture_names(
-    captures: Sequence[Capture], file_owners: Mapping[str, str] = MappingProxyType({})
-) -> list[Capture]:
+def with_unique_capture_names(captures: Sequence[Capture], file_owners: Mapping[str, str]) -> list[Capture]:
     """Return the captures with a number added to names that are those of an earlier capture, of a file of the run, or
-    of another capture's band file. `file_owners` is from `band_file_owners`.
+    of another capture's band file. `file_owners` is from `band_file_owners`, or empty without band files.
     """
     taken = {Path(file).stem for file in (RUN_FILE, PANELS_FILE, SKY_FILE, SUMMARY_FILE, REPORT_FILE)}
     counts: Counter[str] = Counter()
