@@ -10,7 +10,7 @@ from typing import Any
 from PIL import ExifTags
 
 from agalign.cameras.tag_text import iso_time, numbers_in
-from agalign.cameras.tiff_directory import EXIF, GPS, read_directories, values
+from agalign.cameras.tiff_directory import EXIF, GPS, Directory, read_directories, values
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.host.text import shortened, without_controls
@@ -106,6 +106,11 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         kind = suffix_format(path) or "TIFF"
         what = f"not a readable {kind} ({error or 'empty'})"
         raise UnreadableFileError(f"{path}: {what}", "copy it from the card again") from None
+    return tags_of(directories)
+
+
+def tags_of(directories: Mapping[int, Directory]) -> Tags:
+    """Return the tags in the directories of a file, which are from `read_directories`."""
     first, exif, gps = (
         {names.get(tag, str(tag)): values(entry) for tag, entry in directories[key].items()}
         for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))

@@ -10,12 +10,11 @@ from PIL.ExifTags import Base
 
 from agalign.cameras import dji, dls, micasense, pix4d, tiff_directory
 from agalign.cameras.makers import camera_of
-from agalign.cameras.metadata import Tags, finite, read_tags
+from agalign.cameras.metadata import Tags, finite, tags_of
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import GridVignetting
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Directory
 from agalign.cameras.xmp import Packet, names_in
-from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band, is_clock_set
 from agalign.values.image import OutputGrid
 
@@ -80,13 +79,11 @@ def band_tags(
     with_offsets = {Base.MakerNote, Base.ExifInteroperabilityOffset}  # these refer to the old file
     exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in with_offsets | _GEOMETRIC_EXIF}
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
-    with suppress(UnreadableFileError):
-        reference_tags, own_tags = (read_tags(band.path, band.page) for band in (reference, source))
-        packet.take(reference_packet, _GEOMETRY)
-        _put_geometry(packet, reference, reference_tags, grid)
-        _put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
-        if serialised := packet.serialised():
-            first[XMP] = tiff_directory.byte_string(serialised)
+    packet.take(reference_packet, _GEOMETRY)
+    _put_geometry(packet, reference, tags_of(of_reference), grid)
+    _put_radiometry(packet, tags_of(own), vignetting, radiometry=radiometry)
+    if serialised := packet.serialised():
+        first[XMP] = tiff_directory.byte_string(serialised)
     exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], grid)
     return _without_unset_clock(first), exif, own[GPS]
 
