@@ -85,11 +85,14 @@ def sky_captures(captures: Iterable[Capture], examine: Examine = call) -> tuple[
 def sky_radiance(band: Band) -> float | None:
     """Return the median radiance of a band, W / m^2 / sr / nm.
 
-    None without calibration by the camera, or if half of the band is saturated. Raises UnreadableFileError.
+    None without calibration by the camera, if half of the band is saturated, or if its file cannot be read.
     """
     if band.radiometry is None or band.radiometry.quantity != "radiance":
         return None
-    pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
+    try:
+        pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
+    except AgalignError:
+        return None
     if band.saturation_value is not None:
         valid &= pixels.astype(np.float64) < band.saturation_value
     if valid.mean() < _MIN_SHARE:

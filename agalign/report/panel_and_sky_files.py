@@ -1,14 +1,13 @@
 """Writes the captures of calibration panels and of the sky, with a picture of each panel."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from agalign.errors import AgalignError, UnreadableFileError
+from agalign.errors import UnreadableFileError
 from agalign.flight.footprint import accuracy_of_footprint_m, footprint
 from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
@@ -16,7 +15,7 @@ from agalign.host.files import PANELS_FILE, SKY_FILE, check_inside, write_model
 from agalign.pixels.raster import read_preview
 from agalign.rasters.drawing import Picture, side_by_side, titled, write_png
 from agalign.records.panels_and_sky import PanelPart, PanelsFile, SkyFile, SkyPart
-from agalign.values.capture import Band, Capture, source_file
+from agalign.values.capture import Capture, source_file
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
@@ -54,10 +53,9 @@ def write_sky(sky: Sequence[SkyCapture], out: Path, others: Sequence[SkyPart] = 
     """
     parts = []
     for one in sky:
-        bands = [
-            {"band": b.name, "file": source_file(one.capture, b), "radiance": _radiance(b)} for b in one.capture.bands
-        ]
-        parts.append(SkyPart.model_validate(_identity(one.capture) | {"cues": one.cues, "bands": bands}))
+        shown = one.capture
+        bands = [{"band": b.name, "file": source_file(shown, b), "radiance": sky_radiance(b)} for b in shown.bands]
+        parts.append(SkyPart.model_validate(_identity(shown) | {"cues": one.cues, "bands": bands}))
     write_model(out / SKY_FILE, SkyFile(captures=[*others, *parts]) if others or parts else None)
     return parts
 
@@ -91,12 +89,6 @@ def _panel_band(reading: BandReading, capture: Capture) -> dict[str, Any]:
         "other_albedo": reading.other_albedo,
         "problem": reading.problem or (None if factor is not None else "its reflectance or the band's is not known"),
     }
-
-
-def _radiance(band: Band) -> float | None:
-    with suppress(AgalignError):
-        return sky_radiance(band)
-    return None
 
 
 def _tile(reading: BandReading) -> Picture:
