@@ -82,21 +82,19 @@ def without_companions(images: Sequence[Path], folder: Path) -> tuple[list[Path]
     elsewhere = {path.name for path in images if not _MASK_FOLDER.fullmatch(path.parent.name)}
 
     def is_companion(path: Path) -> bool:
+        if any(map(_SMALL_COPIES.fullmatch, path.relative_to(folder).parts[:-1])):
+            return True
         if _MASK_FOLDER.fullmatch(path.parent.name) and path.name in elsewhere:
             return True
         end = _COMPANION_END.search(path.stem)
         of_image = "" if end is None else path.stem[: end.start()]
         return any((there, of_image) in stems for there in (path.parent, path.parent.parent))
 
-    known = [
-        p for p in images if any(map(_SMALL_COPIES.fullmatch, p.relative_to(folder).parts[:-1])) or is_companion(p)
-    ]
-    if not known:
-        return list(images), []
-    skipped = set(known)
-    text = f"masks and thumbnails beside the images are skipped, {counted(len(known), 'file')} in all"
-    problem = problem_of(known[0], text, is_harmless=True)
-    return [path for path in images if path not in skipped], [problem]
+    kept, skipped = list[Path](), list[Path]()
+    for path in images:
+        (skipped if is_companion(path) else kept).append(path)
+    text = f"masks and thumbnails beside the images are skipped, {counted(len(skipped), 'file')} in all"
+    return kept, [problem_of(path, text, is_harmless=True) for path in skipped[:1]]
 
 
 _SMALL_COPIES = re.compile(r"@eadir|[.@]*_*thumb(?:nail)?s?|#?@?recycle", re.IGNORECASE)
