@@ -33,8 +33,8 @@ _TILE_PX = 640
 """Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of
 it."""
 
-_Tiles = Sequence[tuple[Tile, FixedWindows]]
-"""Tiles with the windows of the reference."""
+_Tiles = Sequence[tuple[tuple[int, int], Tile, FixedWindows]]
+"""Tiles with the windows of the reference; first the column and row of the cell that each tile is in."""
 
 
 def is_worth_refining(pair: BandPair, alignment: Alignment) -> bool:
@@ -65,7 +65,8 @@ def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue |
     up = pair.scales.fixed.inverse, pair.scales.moving.inverse
     residual, mapping = start.residual.in_file_px(pair.scales), start.mapping.rescaled(*up)
     with open_raster(reference.path, reference.page) as source:
-        chosen = [(tile, _windows(source, reference, tile)) for tile in _tiles(residual, reference.size_px)]
+        tiles = _tiles(residual, reference.size_px)
+        chosen = [(cell, tile, _windows(source, reference, tile)) for cell, tile in tiles.items()]
     max_moved_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
     try:
         fitted = cross_fitted(
@@ -73,7 +74,7 @@ def at_full_resolution(reference: Band, start: Candidate) -> Candidate | Issue |
             lambda at: _residual(pair.bands[0], at, chosen),
             reference.size_px,
             chessboard,
-            min((windows.side for _, windows in chosen), default=_TILE_PX),
+            min((windows.side for *_, windows in chosen), default=_TILE_PX),
             max_moved_px=max_moved_px,
         )
     except UnreadableFileError as unreadable:
@@ -104,9 +105,9 @@ def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
     return FixedWindows(fixed.valid, structure_field(fixed))
 
 
-def _tiles(residual: Residual, size_px: Size) -> list[Tile]:
-    """Return, for each cell of the reference (width, height), a tile around the window with the highest peak in the
-    reduced images.
+def _tiles(residual: Residual, size_px: Size) -> dict[tuple[int, int], Tile]:
+    """Return a tile for each cell of the reference (width, height), by its column and row: around the window with the
+    highest peak in the reduced images.
     """
     # (columns, rows) of cells with one tile each: a few determine eight parameters, all of them fit into memory.
     min_cells, max_cells = (4, 3), (8, 6)
@@ -116,7 +117,7 @@ def _tiles(residual: Residual, size_px: Size) -> list[Tile]:
         if math.isfinite(residual.shifts_px[index, 0]):
             (column, x0, width), (row, y0, height) = map(_side, residual.centres_px[index], size_px, counts)
             best[column, row] = Tile(x0, y0, width, height)
-    return list(best.values())
+    return best
 
 
 def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
@@ -131,14 +132,15 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
     parts = [Residual(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
     with open_raster(moving.path, moving.page) as source:
-        for tile, windows in tiles:
+        for cell, tile, windows in tiles:
             # GDAL's block cache serves neighbouring tiles of the open file.
             warped = resample_tile(moving, mapping, tile, "lanczos", read=partial(read_tile, dataset=source))
             part = windows.residuals(_raster(*warped, moving))
-            # The cells of neighbouring tiles are adjacent, as a misaligned area may be in several.
-            origin_px, size_px = np.array([tile.x0, tile.y0]), np.array([tile.width, tile.height])
-            first_cell = (origin_px + size_px / 2).astype(np.int64) // size_px * (size_px // windows.side)
-            parts.append(replace(part, centres_px=part.centres_px + origin_px, cells=part.cells + first_cell))
+            # The windows of neighbouring tiles are adjacent, as a misaligned area may be in several.
+            first = np.array(cell) * (np.array([tile.width, tile.height]) // windows.side)
+            parts.append(
+                replace(part, centres_px=part.centres_px + np.array([tile.x0, tile.y0]), cells=part.cells + first)
+            )
     return Residual.joined(parts)
 
 

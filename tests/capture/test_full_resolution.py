@@ -111,9 +111,9 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
 def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
     """Adjacent windows have different colours wherever a tile is, and none have the same cell."""
     reference, moving = capture.reference, capture.moving[0]
-    tiles = [Tile(30, 10, 360, 330), Tile(400, 10, 360, 330), Tile(30, 450, 360, 330)]
+    tiles = {(0, 0): Tile(30, 10, 360, 330), (1, 0): Tile(400, 10, 360, 330), (0, 1): Tile(30, 450, 360, 330)}
     with open_raster(reference.path, reference.page) as source:
-        chosen = [(tile, full_resolution._windows(source, reference, tile)) for tile in tiles]
+        chosen = [(cell, tile, full_resolution._windows(source, reference, tile)) for cell, tile in tiles.items()]
     residual = full_resolution._residual(moving, PixelMapping(TRUTH), chosen)
     assert len(np.unique(residual.cells, axis=0)) == len(residual.cells) > 20
     apart = np.abs(residual.centres_px[:, None] - residual.centres_px).sum(axis=2)
@@ -123,9 +123,19 @@ def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
     assert (colours[first] != colours[second]).all()
     in_first, in_second = (
         (residual.centres_px >= (t.x0, t.y0)) & (residual.centres_px < (t.x0 + t.width, t.y0 + t.height))
-        for t in tiles[:2]
+        for t in list(tiles.values())[:2]
     )
     assert residual.cells[in_second.all(axis=1), 0].min() - residual.cells[in_first.all(axis=1), 0].max() == 1
+
+
+def test_windows_of_neighbouring_tiles_are_adjacent_however_large_the_file_is(capture: Capture) -> None:
+    """Tiles that are far apart are neighbours too: a misaligned area between them is in both."""
+    reference, moving = capture.reference, capture.moving[0]
+    tiles = {(3, 0): Tile(30, 10, 360, 330), (4, 0): Tile(600, 10, 360, 330)}
+    with open_raster(reference.path, reference.page) as source:
+        chosen = [(cell, tile, full_resolution._windows(source, reference, tile)) for cell, tile in tiles.items()]
+    columns = full_resolution._residual(moving, PixelMapping(TRUTH), chosen).cells[:, 0]
+    assert sorted(set(columns)) == list(range(columns.min(), columns.max() + 1))
 
 
 def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture, pair: BandPair) -> None:
