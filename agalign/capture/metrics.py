@@ -15,14 +15,18 @@ from agalign.verify.moved import moved_areas
 
 def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
     """Return an alignment between the files with similarity metrics of the images before (borders overlaid) and after
-    alignment, and with the areas that moved in its error.
+    alignment, with those of its windows, and with the areas that moved in its error.
     """
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     mapping = alignment.mapping.rescaled(pair.scales.fixed, pair.scales.moving)
     mapping.hold_positions(pair.fixed.size_px)
     after = pair.warped_moving(mapping)
-    measured = replace(alignment, before=similarity.to(before), after=similarity.to(after))
+    of_pixels, residual = similarity.to(after), alignment.residual
+    if residual is not None:
+        median_px, p95_px, coverage = residual.median_px, residual.p95_px, residual.coverage
+        of_pixels = replace(of_pixels, residual_px=median_px, residual_p95_px=p95_px, residual_coverage=coverage)
+    measured = replace(alignment, before=similarity.to(before), after=of_pixels)
     return _with_moved_areas(measured, pair, after)
 
 

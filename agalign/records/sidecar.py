@@ -10,7 +10,6 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import compress
 from typing import Annotated, Any, Literal, Self
 
@@ -55,6 +54,7 @@ from agalign.values.fields import (
 from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue
 from agalign.values.lens import Lens
+from agalign.values.lens_shapes import CORNERS, SHAPES
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.moved_area import MovedArea
@@ -222,7 +222,7 @@ class ErrorPart(_Part):
     null for a prediction by other bands or captures, whose windows are no part of the error."""
     rig_std_px: Number4 = 0.0
     """Standard error of a prediction by other bands or captures, the same everywhere."""
-    lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
+    lens_std_px: Annotated[NDArray[np.float64], Array((SHAPES,), 6)] | None = None
     """Standard deviations of the lens shapes that neither tags nor a rig determine."""
     field_std_px: Number4 = 0.0
     """Spread of the displacement field."""
@@ -250,7 +250,7 @@ class ErrorPart(_Part):
     @field_validator("covariance_px2")
     @classmethod
     def _has_size(cls, covariance: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-        if covariance is not None and covariance.shape not in ((8, 8), (12, 12)):
+        if covariance is not None and covariance.shape not in ((CORNERS,) * 2, (CORNERS + SHAPES,) * 2):
             raise ValueError("it is neither 8 x 8 nor 12 x 12")
         return covariance
 
@@ -359,7 +359,7 @@ class BandResult(_Part):
             field=mapping.field,
             grid=GridPart(reference_px=grid_px, moving_px=mapping(grid_px)),
             relief=relief,
-            metrics=MetricsPart(before=alignment.before, after=_after(alignment), windows=alignment.residual),
+            metrics=MetricsPart(before=alignment.before, after=alignment.after, windows=alignment.residual),
             geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.held_out_p95_px)),
             error=ErrorPart.of(alignment),
             **_values(alignment, _SAME_IN_ALIGNMENT),
@@ -407,17 +407,6 @@ def _source(capture: Capture, band: Band) -> dict[str, Any]:
     facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
     facts |= {"missing_rows": band.missing_rows}
     return facts | {"file": source_file(capture, band), "band_index": band.band_index}
-
-
-def _after(alignment: Alignment) -> Similarity:
-    if (residual := alignment.residual) is None:
-        return alignment.after
-    return replace(
-        alignment.after,
-        residual_px=residual.median_px,
-        residual_p95_px=residual.p95_px,
-        residual_coverage=residual.coverage,
-    )
 
 
 class IlluminationPart(_Part):

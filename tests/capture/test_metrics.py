@@ -26,6 +26,8 @@ def test_what_moved_is_in_the_error_of_an_aligned_band_and_changes_nothing_else(
     residual = residual_of(np.zeros((10, 2)), (0.1, 0.0))
     aligned = Alignment(pair.mapping(TRUTH), (640, 480), (), seed, residual=residual, error=error, std_px=0.1)
     measured = with_metrics(aligned, pair)
+    after = measured.after
+    assert (after.residual_px, after.residual_p95_px, after.residual_coverage) == (0.1, 0.1, 1.0)
     assert measured.error is not None
     (area,) = measured.error.moved
     np.testing.assert_allclose(area.shift_px, (9, 0), atol=0.3)
