@@ -40,6 +40,10 @@ _FACTOR_SETS: tuple[Factors, ...] = (
     ("distance", "tilt", "motion"),
 )
 """Candidates in the order of preference: on parallel flight lines, motion alone resembles distance with motion."""
+_UNKNOWN_STD = 1000.0
+"""Of the prior of parameters that only the captures determine."""
+_LAYOUT_STD = 0.015
+"""Standard deviation of the lens positions of a camera model, relative to the norm of all baselines."""
 
 
 def learn_rig(
@@ -56,7 +60,8 @@ def learn_rig(
         return None
     table = _Table(captures, bands, size_px, layout)
     factors, errors_px = table.selected_factors(apply)
-    fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors)
+    fitted, nu_w = table.fit(np.ones(len(captures)), factors)
+    t_std = table.baseline_std(nu_w, errors_px)
     offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), zip(bands, fitted[:, 6:8].tolist(), strict=True)
     by_capture = zip(captures, nu_w.tolist(), strict=True)
     result = Rig(
@@ -69,16 +74,19 @@ def learn_rig(
         captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
         from_bands_px=dict(zip(bands, errors_px.tolist(), strict=True)),
     )
-    return replace(result, parallax_px=_parallax_px(captures, result))
+    are_known = not rig.has_delays(factors) and (bool(factors) or table.layout is not None)
+    return replace(result, parallax_px=_parallax_px(captures, result.baselines if are_known else None, bands))
 
 
-def _parallax_px(captures: Sequence[Observation], learned: Rig) -> dict[str, float]:
+def _parallax_px(
+    captures: Sequence[Observation], baselines: Mapping[str, tuple[float, float]] | None, bands: Sequence[str]
+) -> dict[str, float]:
     """Return the RMS displacement of each band by the reliefs of the captures, px of the reference.
 
     A band without a relief in a capture that has one, such as a thermal band, gets that of the other bands, as the
-    displacement is proportional to the baseline; the largest if delays hide the baselines.
+    displacement is proportional to the baseline; the largest if the baselines are not known, as delays hide them.
     """
-    lengths = {band: math.hypot(*baseline) for band, baseline in learned.baselines.items()}
+    lengths = {band: 1.0 if baselines is None else math.hypot(*baselines[band]) for band in bands}
     squares_px2: dict[str, list[float]] = {band: [] for band in lengths}
     for capture in captures:
         known = [(lengths[b], px) for b, px in capture.parallax_px.items() if b in lengths]
@@ -87,7 +95,7 @@ def _parallax_px(captures: Sequence[Observation], learned: Rig) -> dict[str, flo
         largest_px = max(capture.parallax_px.values(), default=0.0)
         for band, length in lengths.items():
             if band in capture.mappings:
-                by_others_px = largest_px if rig.has_delays(learned.factors) else per_length_px * length
+                by_others_px = largest_px if baselines is None else per_length_px * length
                 squares_px2[band].append(capture.parallax_px.get(band, by_others_px) ** 2)
     return {band: float(np.sqrt(np.mean(squares))) for band, squares in squares_px2.items()}
 
@@ -124,21 +132,18 @@ class _Table:
                 factors, errors_px = candidate, candidate_px
         return factors, errors_px
 
-    def fit(self, is_used: Array, factors: Sequence[Factor]) -> tuple[Array, Array, Array]:
+    def fit(self, is_used: Array, factors: Sequence[Factor]) -> tuple[Array, Array]:
         """Fit the model by alternating least squares: the factors of captures, then the parameters of bands.
 
         Without factors, the distance is fitted.
         `is_used` (captures,) is 0 for captures that are left out. Return (bands, 9) the coefficients of the means minus
-        the medians, px, t and d, (bands,) the standard error of each coordinate of t, and (captures, 5) the factors.
+        the medians, px, t and d, and (captures, 5) the factors.
         """
         factors = factors or ("distance",)
         weights, tensor = self.weights * is_used[:, None], design_tensor(factors)
         bands = np.hstack([np.zeros((len(self.median), 6)), self._initial(weights, factors)])
         of_offset = np.broadcast_to(np.eye(6).reshape(2, 3, 6), (len(weights), 2, 3, 6))
-        unknown_std = 1000.0  # prior of parameters that only the captures determine
-        layout_std = 0.015  # of the lens positions of a camera model, relative to the norm of all baselines
-        t_std = unknown_std if self.layout is None else layout_std
-        std = np.array([unknown_std] * 6 + [t_std, t_std, unknown_std])
+        std = np.array([_UNKNOWN_STD] * 6 + [self._t_std, self._t_std, _UNKNOWN_STD])
         max_iterations, max_change = 20, 1e-4  # change of the means, px, and of the baselines, of norm 1
         for _ in range(max_iterations):
             offset, lens = bands[:, :6].reshape(-1, 2, 3), bands[:, 6:]
@@ -146,7 +151,7 @@ class _Table:
             # The median is robust to a few captures at another height.
             result -= np.median(result[is_used > 0], axis=0)
             # Errors of the baselines displace captures far from the median factors.
-            displaced_px2 = layout_std**2 * (result[:, NU] ** 2).sum(axis=1, keepdims=True)
+            displaced_px2 = _LAYOUT_STD**2 * (result[:, NU] ** 2).sum(axis=1, keepdims=True)
             weights_of_bands = (weights / (1 + weights * displaced_px2)).T
             design = np.concatenate([of_offset, np.moveaxis(tensor @ result.T, (3, 0), (0, 3))], axis=3)
             # Parameters that neither the layout nor the factors determine keep their values.
@@ -157,8 +162,20 @@ class _Table:
             previous, bands = bands, np.hstack([estimate[:, :6], _normalised(estimate[:, 6:], factors)])
             if np.abs(bands - previous).max() < max_change:
                 break
-        information = weights.T @ (result[:, NU] ** 2).sum(axis=1) + 1 / t_std**2
-        return bands, np.minimum(1 / np.sqrt(information), 1.0), result
+        return bands, result
+
+    @property
+    def _t_std(self) -> float:
+        """Standard deviation of the prior of each coordinate of a baseline."""
+        return _UNKNOWN_STD if self.layout is None else _LAYOUT_STD
+
+    def baseline_std(self, factors: Array, errors_px: Array) -> Array:
+        """Return (bands,) the standard error of each coordinate of t, given the factors (captures, 5) and the errors
+        (bands,) of the model.
+        """
+        weights = self.weights / (1 + self.weights * errors_px**2 / 2)
+        information = weights.T @ (factors[:, NU] ** 2).sum(axis=1) + 1 / self._t_std**2
+        return np.asarray(np.minimum(1 / np.sqrt(information), 1.0))
 
     def cross_validated_px(self, factors: Sequence[Factor]) -> Array:
         """Return (bands,) the RMS error of predictions from the other bands, in captures left out of the fit.
@@ -173,7 +190,7 @@ class _Table:
             if (~left_out @ self.weights > 0).all():
                 break
         for is_left_out in left_out:
-            bands, *_ = self.fit(~is_left_out * 1.0, factors)
+            bands, _ = self.fit(~is_left_out * 1.0, factors)
             design = np.tensordot(bands[:, 6:], design_tensor(factors), 1)
             differences = self.differences[is_left_out] - bands[:, :6].reshape(-1, 2, 3)
             for j in range(len(design)):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agalign.flight.learn_rig import _parallax_px, learn_rig
-from agalign.flight.rig import CaptureFactors, Observation, Rig, distance_px, expected_square
+from agalign.flight.rig import CaptureFactors, Observation, Rig, displaced, distance_px, expected_square
 from agalign.flight.rig_prediction import contradicts, estimated_factors, predict_band, unobserved_error_px
 from agalign.values import geometry
 
@@ -129,8 +129,30 @@ def test_a_band_without_a_relief_has_the_parallax_of_the_others_by_its_baseline(
     assert learned.parallax_px["NIR"] == pytest.approx(3.0 * lengths["NIR"] / lengths["Red"])
     assert learn_rig(flight(4), SIZE, {}).parallax_px == dict.fromkeys(learned.mean, 0.0)
     # Baselines orthogonal to delays are not those of the lenses.
-    with_delays = replace(learned, factors=("motion",), baselines=dict.fromkeys(learned.mean, (0.0, 0.0)))
-    assert _parallax_px(captures, with_delays) == pytest.approx(dict.fromkeys(learned.mean, 3.0))
+    assert _parallax_px(captures, None, list(learned.mean)) == pytest.approx(dict.fromkeys(learned.mean, 3.0))
+
+
+def test_baselines_that_nothing_determines_do_not_scale_the_parallax() -> None:
+    """Captures from one height: without a layout, their baselines are noise."""
+    captures = [observation(10.0 * k, 0.0, noise=0.05, seed=k) for k in range(4)]
+    captures[0] = replace(captures[0], parallax_px={"Red": 6.0})
+    learned = learn_rig(captures, SIZE, {})
+    assert learned.factors == ()
+    assert learned.parallax_px == pytest.approx(dict.fromkeys(learned.mean, 3.0))
+
+
+def test_the_standard_error_of_a_baseline_contains_what_the_model_does_not_explain() -> None:
+    rng, nu = np.random.default_rng(3), np.linspace(-6, 6, 16)
+    scattered = [observation(10.0 * k, nu_k) for k, nu_k in enumerate(nu)]
+    for number, capture in enumerate(scattered):
+        moved = {b: displaced(m, 0.3 * rng.normal(size=(2, 3)), SIZE) for b, m in capture.mappings.items()}
+        scattered[number] = replace(capture, mappings=moved)
+    exact = learn_rig([observation(10.0 * k, nu_k) for k, nu_k in enumerate(nu)], SIZE, {})
+    learned = learn_rig(scattered, SIZE, {})
+    errors = [np.subtract(learned.baselines[b], exact.baselines[b]) for b in exact.mean]
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    claimed = float(np.sqrt(np.mean(np.square(list(learned.baseline_std.values())))))
+    assert 0.3 * claimed < rms < 1.5 * claimed
 
 
 @pytest.mark.slow
