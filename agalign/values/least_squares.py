@@ -41,8 +41,8 @@ class Robust(NamedTuple):
     variance: Callable[[float], float] = lambda _: 1.0
     """Returns the variance along a component of an observation of weight 1 from that scale; 1 if the weights are
     inverse variances, or relative to the prior."""
-    iterations: int = 6
-    """Enough for the weights to converge where few observations are outliers."""
+    iterations: int = 12
+    """Enough for the weights to converge where up to 40 % of the observations are outliers."""
 
 
 def least_squares(
@@ -102,5 +102,8 @@ def cauchy_weights(residuals: ArrayLike, scale: float | Array) -> Array:
 
 
 def mean_in_standard_errors(values: Array) -> float:
-    """Return the mean of values (n,) relative to its standard error."""
-    return float(values.mean() / max(values.std() / math.sqrt(len(values)), 1e-12))
+    """Return the mean of values (n,) relative to its standard error; 0 for few values, whose spread is unknown."""
+    min_values = 10  # noise exceeds four of these standard errors in 0.3 % of the cases, and in 4 % with four values
+    if len(values) < min_values:
+        return 0.0
+    return float(values.mean() / max(values.std(ddof=1) / math.sqrt(len(values)), 1e-12))

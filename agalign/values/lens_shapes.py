@@ -22,6 +22,8 @@ LENS_STD = (1.3e-3, 0.7e-3, 1.2e-3, 1.2e-3)
 """Standard deviation of each shape at the corners, as a share of half the diagonal. The lenses of 28 band pairs of six
 cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tags) differ by 1.0, 0.6, 1.0 and 1.0 px
 at 800 px from the centre."""
+SHAPES = len(LENS_STD)
+"""Number of shapes."""
 CALIBRATED = 0.4
 """Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
 _VARIANCE_FACTOR = 12.0

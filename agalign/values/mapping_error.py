@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from agalign.values import geometry
 from agalign.values.geometry import PairScales, Points
 from agalign.values.image import FloatImage, Tile
-from agalign.values.lens_shapes import CORNERS, lens_shapes, variance_of_shapes_px2, variance_px2
+from agalign.values.lens_shapes import CORNERS, SHAPES, lens_shapes, variance_of_shapes_px2, variance_px2
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
@@ -150,7 +150,7 @@ class MappingError:
         `parallax` that between the files.
         """
         up = scales.fixed.inverse
-        per_axis = np.r_[np.tile(up, 4), np.full(4, up.mean)]
+        per_axis = np.r_[np.tile(up, 4), np.full(SHAPES, up.mean)]
         return replace(
             self,
             size_px=size_px,

@@ -187,14 +187,14 @@ def square_weights(residual: Residual) -> NDArray[np.float64]:
 
 def decrease_in_standard_errors(before: Residual, after: Residual) -> float:
     """Return the mean decrease of held-out shifts relative to its standard error, in the windows that both residuals
-    have measured; 0 with fewer than two.
+    have measured; 0 if these are few.
 
     It is that of log(1 + (length / 0.3 px)^2), which is robust to wrong peaks. The windows are of one grid.
     """
     scale_px = 0.3
     before_px, after_px = lengths_in_common_px(before, after)
     losses = [np.log1p((px / scale_px) ** 2) for px in (before_px, after_px)]
-    return mean_in_standard_errors(losses[0] - losses[1]) if len(before_px) > 1 else 0.0
+    return mean_in_standard_errors(losses[0] - losses[1])
 
 
 def lengths_in_common_px(one: Residual, other: Residual) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

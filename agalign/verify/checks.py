@@ -103,8 +103,12 @@ def _descriptor_issues(joint: JointResult | None, residual: Residual) -> Iterato
     """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows."""
     if joint is None:
         return
-    is_confirmed = joint.recipe == BY_WINDOWS and len(residual.measured_px) >= _MIN_VERIFYING_WINDOWS
-    if not (joint.is_retrieved or is_confirmed):
+    count = len(residual.measured_px)
+    if joint.is_retrieved or (joint.recipe == BY_WINDOWS and count >= _MIN_VERIFYING_WINDOWS):
+        return
+    if joint.recipe == BY_WINDOWS and joint.retrieval >= joint.min_retrieval:
+        yield Issue(FEW_WINDOWS, count, _MIN_VERIFYING_WINDOWS)
+    else:
         yield Issue(RETRIEVAL, joint.retrieval, joint.min_retrieval)
 
 

@@ -106,8 +106,21 @@ def test_an_overlapping_window_is_verified_without_those_that_share_pixels_with_
     distance_px = np.abs(centres_px - centres_px[window]).max(axis=1)
     assert np.count_nonzero(distance_px < side_px) == 9
     overlaps = (distance_px < side_px) & (distance_px > 0)
-    np.testing.assert_allclose(change_px[overlaps], 0, atol=1e-5)
+    np.testing.assert_allclose(change_px[overlaps], 0, atol=1e-4)  # the mapping of all windows moves a little
     assert np.abs(change_px[distance_px >= side_px]).max() > 1e-4
+
+
+def test_many_wrong_peaks_on_one_side_do_not_move_a_homography() -> None:
+    """Four of ten windows, as of saturated images that move."""
+    rng, errors_px = np.random.default_rng(1), []
+    for _ in range(20):
+        shifts_px = 0.1 * rng.normal(size=CENTRES.shape)
+        is_wrong = rng.random(len(CENTRES)) < 0.4
+        shifts_px[is_wrong] = rng.uniform((-8, -20), (32, 20), (int(is_wrong.sum()), 2))
+        fit = fit_windows(IDENTITY, residual_of(CENTRES, shifts_px), SIZE)
+        assert fit is not None
+        errors_px.append(np.abs(fit.corners_px).max())
+    assert np.median(errors_px) < 0.3
 
 
 def test_windows_without_a_shift_are_in_no_fold() -> None:

@@ -37,7 +37,9 @@ def test_corners_move_a_homography_and_all_points_with_them() -> None:
     moved_px = np.array([0.3, -0.2, 0.1, 0.4, -0.5, 0.2, 0.0, -0.1])
     change = geometry.moving_corners(moved_px, 1280, 960)
     corners = geometry.corners(1280, 960)
-    np.testing.assert_allclose((geometry.apply(change, corners) - corners).ravel(), moved_px, atol=1e-3)
+    for factor in (1, 10):
+        large = geometry.moving_corners(factor * moved_px, 1280, 960)
+        np.testing.assert_allclose((geometry.apply(large, corners) - corners).ravel(), factor * moved_px, atol=1e-4)
     points = geometry.lattice(1280, 960, 6, 5)
     there = points + geometry.over_corners(points, 1280, 960) @ moved_px
     np.testing.assert_allclose(geometry.apply(change, points), there, atol=1e-3)

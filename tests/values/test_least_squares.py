@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
+from agalign.values.least_squares import (
+    MIN_SHIFT_SCALE_PX,
+    Robust,
+    cauchy_weights,
+    least_squares,
+    mean_in_standard_errors,
+    shift_scale_px,
+)
 
 X = np.random.default_rng(0).normal(size=(200, 2, 3))
 TRUTH = np.array([1.0, -2.0, 0.5])
@@ -43,6 +50,13 @@ def test_the_first_weights_decide_between_two_groups() -> None:
         near = cauchy_weights(np.linalg.norm(values - X @ start, axis=1), 0.3)
         estimate = least_squares(X, values, np.ones(200), NO_PRIOR, robust=Robust(0.3), first_weights=near)
         np.testing.assert_allclose(estimate.mean, start, atol=0.05)
+
+
+def test_the_spread_of_few_values_is_unknown() -> None:
+    assert mean_in_standard_errors(np.array([1.0, 1.01, 0.99, 1.0])) == 0.0
+    assert mean_in_standard_errors(np.r_[np.full(10, 0.9), np.full(10, 1.1)]) == pytest.approx(
+        1 / 0.1 * 19**0.5, rel=1e-6
+    )
 
 
 def test_a_direction_without_observations_is_uncertain() -> None:

@@ -170,7 +170,9 @@ def test_without_descriptors_more_windows_are_required(recipe: str, residual: Re
 def test_descriptors_do_not_confirm_a_mapping_that_is_fitted_to_windows() -> None:
     """Their retrieval was measured under another mapping."""
     joint = joint_result(retrieval=0.9, recipe="windows")
-    assert codes(replace(GOOD, joint=joint, windows=shifted(0, 0.0, 11))) == ["retrieval"]
+    assert codes(replace(GOOD, joint=joint, windows=shifted(0, 0.0, 11))) == ["few_windows"]
+    lost = joint_result(retrieval=0.1, recipe="windows")
+    assert codes(replace(GOOD, joint=lost, windows=shifted(0, 0.0, 11))) == ["retrieval"]
 
 
 @pytest.mark.parametrize(
