@@ -28,9 +28,8 @@ from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.gdal import open_local
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import open_raster, suffix_format, with_nan
+from agalign.pixels.raster import open_raster, suffix_format
 from agalign.rasters.band_reader import RAW
-from agalign.rasters.drawing import MAX_REDUCED_PX, Grey, grey
 from agalign.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
@@ -171,9 +170,9 @@ def _written(
     kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags
 ) -> WrittenFile:
     """Write layers as the bands of one file, and return it."""
-    nodata, grey_of = write_raster(context, layers, path, tags, is_stack=kind == Stack.kind)
+    nodata = write_raster(context, layers, path, tags, is_stack=kind == Stack.kind)
     bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
-    return WrittenFile(kind, path, bands, nodata, is_flat=is_flat, grey=grey_of)
+    return WrittenFile(kind, path, bands, nodata, is_flat=is_flat)
 
 
 def write_raster(
@@ -183,9 +182,8 @@ def write_raster(
     tags: TransferredTags | None = None,
     *,
     is_stack: bool = False,
-) -> tuple[float | None, Mapping[str, Grey]]:
-    """Write layers of a capture as the bands of one file atomically; return its nodata value, and the bands as grey
-    images by name where these need no reduction.
+) -> float | None:
+    """Write layers of a capture as the bands of one file atomically; return its nodata value.
 
     The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
     radiometric calibration. A nodata value is declared if the reference declares one, for floats, or if some pixel
@@ -213,13 +211,12 @@ def write_raster(
         elif tags is not None:
             add_directories(partial, *tags)
 
-    grey_of: dict[str, Grey] = {}
-    blocks, georeference = _blocks(context, layers, dtype, nodata, grey_of), capture.reference.georeference
+    blocks, georeference = _blocks(context, layers, dtype, nodata), capture.reference.georeference
     descriptions, own_tags, grid = _descriptions(context, layers), _tags(capture, layers, raw=raw), context.grid
     write_on_grid(
         path, grid, georeference, descriptions, blocks, tags=own_tags, dtype=dtype.name, options=options, finish=finish
     )
-    return nodata, grey_of
+    return nodata
 
 
 def is_aligned_raster(path: Path) -> bool:
@@ -290,13 +287,9 @@ def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
 
 
 def _blocks(
-    context: ProductContext,
-    layers: Sequence[Layer],
-    dtype: np.dtype[Any],
-    nodata: float | None,
-    grey_of: dict[str, Grey],
+    context: ProductContext, layers: Sequence[Layer], dtype: np.dtype[Any], nodata: float | None
 ) -> Iterator[Block]:
-    """Yield the pixels of layers, and add their grey images to `grey_of`."""
+    """Yield the pixels of layers."""
     grid = context.grid
     for index, layer in enumerate(layers, start=1):
         for tile in tiles(grid.tile, WORK_TILE_PX):
@@ -307,8 +300,6 @@ def _blocks(
                 pixels = pixels.astype(dtype, copy=False)
                 if nodata is not None:
                     pixels = with_nodata(pixels, valid, nodata)
-                if pixels.shape == (grid.height, grid.width) and max(pixels.shape) <= MAX_REDUCED_PX:
-                    grey_of[layer.band.name] = grey(with_nan(pixels, nodata))
             yield pixels, index, tile.x0 - grid.x0, tile.y0 - grid.y0
 
 

@@ -17,7 +17,7 @@ from agalign.host.files import complete_file
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import JPEG_MARK, PNG_MARK
 from agalign.pixels.masks import saturated
-from agalign.pixels.raster import ReadTile, read_preview, read_tile, with_nan
+from agalign.pixels.raster import ReadTile, read_preview, read_tile
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid, Tile, reduced_size_px
 from agalign.values.resampling import tiles
@@ -26,7 +26,7 @@ Grey = NDArray[np.uint8]
 """(height, width)"""
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
-MAX_REDUCED_PX = 2048
+_MAX_REDUCED_PX = 2048
 """Longer side of reduced images: larger than most screens."""
 
 
@@ -49,35 +49,24 @@ class ReducedBands:
 
 
 def read_reduced_bands(
-    capture: Capture,
-    places: Mapping[str, tuple[Path, int]],
-    grid: OutputGrid,
-    read: ReadTile = read_tile,
-    written: Mapping[str, Grey] | None = None,
+    capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid, read: ReadTile = read_tile
 ) -> ReducedBands:
     """Read the bands of a capture, given file and index of each written band, and a function that reads the pixels of
-    the capture's files. Those of `written` are known already. Raises UnreadableFileError for the written ones.
+    the capture's files. Raises UnreadableFileError for the written ones.
     """
-    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / MAX_REDUCED_PX))
+    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / _MAX_REDUCED_PX))
     before, saturated_shares = {}, {}
     for band in capture.bands:
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
             to_band = np.divide(band.size_px, np.multiply(grid.scale, capture.reference.size_px))
             corner, extent = np.rint(np.array([(grid.x0, grid.y0), (grid.width, grid.height)]) * to_band).astype(int)
             window = Tile(*corner.tolist(), *extent.clip(1).tolist())
-            if (window.width, window.height) == size_px and _is_inside(window, band.size_px):
-                plane = with_nan(read(band, window)[0], band.nodata)
-            else:
-                window_px = window.x0, window.y0, window.width, window.height
-                plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
-            before[band.name] = grey(plane)
+            window_px = window.x0, window.y0, window.width, window.height
+            before[band.name] = grey(read_preview(band.path, band.index_in_page, window_px, size_px, band.page))
             if band.saturation_value is not None:
                 saturated_shares[band.name] = _saturated_share(band, window, read)
-    whole_px, known = (0, 0, grid.width, grid.height), written or {}
-    after = {
-        name: known[name] if name in known else grey(read_preview(*place, whole_px, size_px))
-        for name, place in places.items()
-    }
+    whole_px = 0, 0, grid.width, grid.height
+    after = {name: grey(read_preview(*place, whole_px, size_px)) for name, place in places.items()}
     return ReducedBands(before, after, size_px, saturated_shares)
 
 
@@ -92,10 +81,6 @@ def _saturated_share(band: Band, window: Tile, read: ReadTile) -> float:
         pixels, valid = read(band, tile)
         count += int(np.count_nonzero(saturated(valid, pixels, band.saturation_value)))
     return count / max(inside.width * inside.height, 1)
-
-
-def _is_inside(tile: Tile, size_px: tuple[int, int]) -> bool:
-    return tile.x0 >= 0 and tile.y0 >= 0 and tile.x0 + tile.width <= size_px[0] and tile.y0 + tile.height <= size_px[1]
 
 
 def grey(plane: NDArray[np.float32]) -> Grey:

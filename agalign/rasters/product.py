@@ -62,8 +62,6 @@ class WrittenFile:
     """Layout of the preview; None for other files."""
     is_flat: bool = False
     """The vignetting of raw numbers is corrected in the pixels."""
-    grey: Mapping[str, Grey] = field(default_factory=dict)
-    """Its bands as grey images where these need no reduction, so that the file is not decoded for them."""
     index_before: tuple[str, Grey] | None = None
     """Of an index raster, the name of the index and its values in the unaligned bands, if these have the pixels of the
     grid, as `ReducedBands.indices_before`."""
@@ -153,8 +151,7 @@ class ProductContext:
     def reduced_bands(self) -> ReducedBands:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         places = {name: (file.path, index) for name, (file, index) in self.places.items()}
-        known = {name: grey for file in self.written for name, grey in file.grey.items()}
-        bands = read_reduced_bands(self.capture, places, self.grid, self.read, known)
+        bands = read_reduced_bands(self.capture, places, self.grid, self.read)
         return replace(bands, indices_before=dict(file.index_before for file in self.written if file.index_before))
 
 
