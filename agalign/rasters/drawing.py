@@ -1,21 +1,22 @@
 """The bands of a capture as reduced grey images, pictures with text, and PNG files."""
 
-import struct
-import zlib
+import io
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 
-from agalign.errors import OutputError, UnreadableFileError
+from agalign.errors import UnreadableFileError
 from agalign.host.files import complete_file
 from agalign.host.memory_limits import WORK_TILE_PX
-from agalign.host.own_files import JPEG_MARK, PNG_MARK
+from agalign.host.own_files import SOFTWARE
 from agalign.pixels.masks import saturated
 from agalign.pixels.raster import ReadTile, read_preview, read_tile
 from agalign.values.capture import Band, Capture
@@ -98,29 +99,22 @@ def grey(plane: NDArray[np.float32]) -> Grey:
 
 
 def write_png(image: Picture, path: Path) -> None:
-    """Write a picture atomically. Raises OutputError."""
+    """Write a picture atomically, in the format of the path's suffix. Raises OutputError."""
     with complete_file(path) as partial:
-        partial.write_bytes(encoded(image[..., ::-1], path))
+        partial.write_bytes(encoded(image, path.suffix))
 
 
-def encoded(image: Picture, path: Path, *options: int) -> bytes:
-    """Return an image, in OpenCV's order of colours, in the format of the path's suffix. Raises OutputError."""
-    is_encoded, data = cv2.imencode(path.suffix, image, options)
-    if not is_encoded:
-        raise OutputError(f"{path}: cannot be encoded")
-    return _marked(data.tobytes())
-
-
-def _marked(data: bytes) -> bytes:
-    """Return a PNG or JPEG file with the name of the program, by which later commands recognise it: a text after the
-    header of a PNG (13 bytes, and 12 of the chunk), or a comment after that of a JPEG.
+def encoded(image: Picture | Grey, suffix: str, quality: int = 95) -> bytes:
+    """Return an image in the format of a suffix, with the name of the program, by which later commands recognise it.
+    `quality` is that of a JPEG.
     """
-    if data.startswith(b"\x89PNG"):
-        at, text = 8 + 12 + 13, b"tEXt" + PNG_MARK
-        part = struct.pack(">I", len(PNG_MARK)) + text + struct.pack(">I", zlib.crc32(text))
-    else:
-        at, part = 4 + int.from_bytes(data[4:6]), JPEG_MARK
-    return data[:at] + part + data[at:]
+    name, file = PngInfo(), io.BytesIO()
+    name.add_text("Software", SOFTWARE)
+    # Each format uses those of these options that it knows. Higher levels of compression take longer and gain little.
+    options: dict[str, Any] = {"pnginfo": name, "comment": SOFTWARE, "software": SOFTWARE, "compress_level": 1}
+    format_name = Image.registered_extensions()[suffix.lower()]
+    Image.fromarray(image).save(file, format_name, quality=quality, **options)
+    return file.getvalue()
 
 
 def with_text(

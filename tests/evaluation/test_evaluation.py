@@ -144,8 +144,12 @@ def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
     offsets = np.array([-40.0, 0.0, 40.0])
     surface = loss_surface(fixed, moving, TRUTH, offsets, settings, Training(keypoints=400, epochs=1))
     assert np.unravel_index(np.nanargmin(surface), surface.shape) == (1, 1)
-    draw_surface(surface, offsets, tmp_path / "surface.png")
-    assert cv2.imread(str(tmp_path / "surface.png")).shape == (552, 552, 3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
+def test_the_picture_of_a_surface_can_be_read(tmp_path: Path, suffix: str) -> None:
+    draw_surface(np.random.default_rng(0).random((5, 5)), np.linspace(-40, 40, 5), tmp_path / f"surface{suffix}")
+    assert cv2.imread(str(tmp_path / f"surface{suffix}")).shape == (552, 552, 3)
 
 
 # ---- learning from pairs
