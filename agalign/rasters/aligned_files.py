@@ -292,7 +292,7 @@ def _blocks(
     """Yield the pixels of layers."""
     grid = context.grid
     for index, layer in enumerate(layers, start=1):
-        for tile in tiles(grid.tile, WORK_TILE_PX):
+        for tile in tiles(grid, WORK_TILE_PX):
             if layer.is_gap:
                 pixels: Pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
             else:
@@ -366,7 +366,7 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
     """
     copied = []
     for layer in (one for one in layers if one.is_copied):
-        read = (layer.read(layer.band, tile) for tile in tiles(grid.tile, WORK_TILE_PX))
+        read = (layer.read(layer.band, tile) for tile in tiles(grid, WORK_TILE_PX))
         copied += [np.unique(pixels[valid] if layer.band.missing else pixels) for pixels, valid in read]
     limits = np.iinfo(str(dtype))
     # All values of a 16-bit type; for larger types the first ones are sufficient.

@@ -126,7 +126,7 @@ class QualityRaster(Product):
         layers = [LayerDescription(name) for name in ("all bands", *(layer.band.name for layer in context.layers))]
         blocks = (
             (flags, index, tile.x0 - grid.x0, tile.y0 - grid.y0)
-            for tile in tiles(grid.tile, WORK_TILE_PX)
+            for tile in tiles(grid, WORK_TILE_PX)
             for index, flags in enumerate(flags_on(tile), start=1)
         )
         # There is no nodata value: 0 means that no flag is set.

@@ -54,6 +54,22 @@ class LayerDescription:
     colour: ColorInterp | None = None
 
 
+def compressed(kind: str, method: Compression = "deflate") -> dict[str, Any]:
+    """Return the creation options of compressed pixels of a kind of numpy type: `f`, `i` or `u`.
+
+    `method` is not `auto`, which `compression_of` resolves.
+    """
+    if method == "none":
+        return {}
+    # TIFF predictor 3 is for floating point, 2 for integers.
+    options: dict[str, Any] = {"compress": method, "predictor": 3 if kind == "f" else 2}
+    return options | ({"zstd_level": _ZSTD_LEVEL} if method == "zstd" else {})
+
+
+FLOAT_OPTIONS: Mapping[str, Any] = {**compressed("f"), "nodata": math.nan}
+"""Creation options of layers of float32."""
+
+
 @contextmanager
 def checked_raster(
     path: Path,
@@ -122,9 +138,9 @@ def write_on_grid(
     layers: Sequence[LayerDescription],
     blocks: Iterable[Block],
     *,
-    tags: Mapping[str, str] | None = None,
+    tags: Mapping[str, str] = {},
     dtype: str = "float32",
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any] = FLOAT_OPTIONS,
     finish: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a tiled raster on an output grid block by block, with the georeference of the reference's file, as
@@ -133,10 +149,8 @@ def write_on_grid(
     A file without a georeference gets no transform: an identity transform would be read as a georeference. Tags mark
     one by the camera's pose as approximate. The tag of the software identifies the file. Raises OutputError.
     """
-    profile, all_tags = (
-        tiled_profile(grid.width, grid.height, len(layers), dtype, **(FLOAT_OPTIONS if options is None else options)),
-        {"TIFFTAG_SOFTWARE": SOFTWARE, **(tags or {})},
-    )
+    profile = tiled_profile(grid.width, grid.height, len(layers), dtype, **options)
+    all_tags = {"TIFFTAG_SOFTWARE": SOFTWARE, **tags}
     if georeference is not None:
         profile |= georeferenced(georeference, grid)
         if georeference.accuracy_m is not None:
@@ -185,18 +199,6 @@ def compression_of(choice: Compression, *, is_stack: bool) -> Compression:
     return "zstd" if is_stack else "deflate"  # programs that read files of single bands often lack Zstandard
 
 
-def compressed(kind: str, method: Compression = "deflate") -> dict[str, Any]:
-    """Return the creation options of compressed pixels of a kind of numpy type: `f`, `i` or `u`.
-
-    `method` is not `auto`, which `compression_of` resolves.
-    """
-    if method == "none":
-        return {}
-    # TIFF predictor 3 is for floating point, 2 for integers.
-    options: dict[str, Any] = {"compress": method, "predictor": 3 if kind == "f" else 2}
-    return options | ({"zstd_level": _ZSTD_LEVEL} if method == "zstd" else {})
-
-
 def to_cog(path: Path, compression: str = "deflate") -> None:
     """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
     cog = path.with_name(f"{path.name}.cog")
@@ -211,10 +213,6 @@ def to_cog(path: Path, compression: str = "deflate") -> None:
         cog.replace(path)
     finally:
         cog.unlink(missing_ok=True)
-
-
-FLOAT_OPTIONS: Mapping[str, Any] = {**compressed("f"), "nodata": math.nan}
-"""Creation options of layers of float32."""
 
 
 def _checksum(pixels: NDArray[Any]) -> int:

@@ -91,11 +91,10 @@ def output_layers(
     layers = [Layer(b, on_frame.get(b.name), size_px, b is reference, read) for b in capture.stack_bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.without_parallax, layer.band) for layer in layers if layer.mapping is not None]
-    crop = frame.tile
-    if common is None and settings.crop != "none":
-        crop = common_area(mapped, frame.width, frame.height) or crop
+    if common is None and settings.crop != "none" and (area := common_area(mapped, frame.width, frame.height)):
+        frame = replace(frame, **vars(area))
     has_relief = any(mapping.parallax is not None for mapping in on_frame.values())
-    return layers, replace(frame, **vars(crop), has_gaps=has_relief or not _covers(mapped, crop))
+    return layers, replace(frame, has_gaps=has_relief or not _covers(mapped, frame))
 
 
 def _frame(reference: Band, mappings: Iterable[PixelMapping], settings: WriteSettings) -> OutputGrid:
@@ -170,7 +169,7 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
         inside &= is_inside(mapping.at_crossings(x, y), band)
     # A cell is inside if its four corners are: between them the mapping is almost linear.
     cells = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
-    result = _largest_rectangle(cells, np.diff(x), np.diff(y))
+    result = _largest_rectangle(cells, x.tolist(), y.tolist())
     if result is None:
         return None
     top, bottom, left, right = result
@@ -178,35 +177,24 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
     return Tile(x0, y0, int(x[right]) - x0 + 1, int(y[bottom]) - y0 + 1)
 
 
-def _largest_rectangle(
-    cells: Mask, widths: NDArray[np.float64], heights: NDArray[np.float64]
-) -> tuple[int, int, int, int] | None:
-    """(top, bottom, left, right), as indices of cell edges, of the rectangle of True cells with the largest area.
+def _largest_rectangle(cells: Mask, x: Sequence[float], y: Sequence[float]) -> tuple[int, int, int, int] | None:
+    """(top, bottom, left, right), as indices of the edges x of columns and y of rows, of the rectangle of True cells
+    with the largest area.
 
     The largest rectangle in a histogram, with a stack, for each row: the histogram is the height of the True cells that
-    end in the row. Equal neighbouring rows and columns are merged before.
+    end in the row.
     """
-    first_rows, first_columns = _changes(cells), _changes(cells.T)
-    rows, columns = ([*firsts.tolist(), n] for firsts, n in zip((first_rows, first_columns), cells.shape, strict=True))
-    left_edge = np.concatenate([[0.0], np.cumsum(widths)])[columns].tolist()
-    top_edge = np.concatenate([[0.0], np.cumsum(heights)])[rows].tolist()
     best_area, best = 0.0, None
-    tops = [0] * len(first_columns)
-    for row, line in enumerate(cells[np.ix_(first_rows, first_columns)].tolist()):
+    tops = [0] * cells.shape[1]
+    for row, line in enumerate(cells.tolist()):
         tops = [top if is_inside else row + 1 for top, is_inside in zip(tops, line, strict=True)]
-        bottom = top_edge[row + 1]
         stack: list[tuple[int, float, int]] = []
         for column, top in enumerate([*tops, row + 1]):
-            start, height = column, bottom - top_edge[top]
+            start, height = column, y[row + 1] - y[top]
             while stack and stack[-1][1] >= height:
                 start, bar_height, bar_top = stack.pop()
-                area = bar_height * (left_edge[column] - left_edge[start])
+                area = bar_height * (x[column] - x[start])
                 if area > best_area:
-                    best_area, best = area, (rows[bar_top], rows[row + 1], columns[start], columns[column])
+                    best_area, best = area, (bar_top, row + 1, start, column)
             stack.append((start, height, top))
     return best
-
-
-def _changes(cells: Mask) -> NDArray[np.int64]:
-    """The indices of the first row and of each row that differs from the previous one."""
-    return np.flatnonzero(np.append(True, (cells[1:] != cells[:-1]).any(axis=1)))

@@ -34,7 +34,7 @@ def index_before(context: ProductContext, index: Index, span: tuple[float, float
     if not has_same_pixels or any(file.is_flat for file in context.written):
         return None
     result = np.empty((grid.height, grid.width), np.uint8)
-    for tile in tiles(grid.tile, WORK_TILE_PX):
+    for tile in tiles(grid, WORK_TILE_PX):
         values = compute(index, [_unaligned(context, layer, tile) for layer in chosen])
         shares = np.nan_to_num((values - span[0]) / (span[1] - span[0]), posinf=0.0, neginf=0.0)
         y, x = tile.y0 - grid.y0, tile.x0 - grid.x0

@@ -67,11 +67,6 @@ class OutputGrid(Tile):
     has_gaps: bool = True
     """Some pixels may be outside the image of a band."""
 
-    @property
-    def tile(self) -> Tile:
-        """The rectangle of the reference's grid at this scale."""
-        return Tile(self.x0, self.y0, self.width, self.height)
-
     def px(self, x: float, y: float) -> tuple[float, float]:
         """Position (x, y) on this grid of a position of the reference."""
         on_grid_x, on_grid_y = self.scale.positions((x, y)).tolist()

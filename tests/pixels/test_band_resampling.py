@@ -74,7 +74,7 @@ def test_largest_rectangle_is_the_largest(cells: np.ndarray) -> None:
     rows, columns = cells.shape
     spans = product(combinations(range(rows + 1), 2), combinations(range(columns + 1), 2))
     areas = [(b - t) * (r - left) for (t, b), (left, r) in spans if cells[t:b, left:r].all()]
-    result = _largest_rectangle(cells, np.ones(columns, int), np.ones(rows, int))
+    result = _largest_rectangle(cells, range(columns + 1), range(rows + 1))
     if not areas:
         assert result is None
     else:

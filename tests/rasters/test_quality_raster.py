@@ -48,7 +48,7 @@ def flags_of(
     *,
     is_predicted: bool = False,
 ) -> np.ndarray:
-    return _flags(layer, GRID.tile, GRID, errors or {}, interpolation, is_predicted=is_predicted)
+    return _flags(layer, GRID, GRID, errors or {}, interpolation, is_predicted=is_predicted)
 
 
 def test_flags_of_a_moved_band_are_where_its_pixels_are(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_every_value_that_saturated_pixels_change_is_flagged(tmp_path: Path, int
         path = tmp_path / f"{number}.tif"
         write_band(path, np.where(saturated, number, 10_000).astype(np.uint16))
         layer = Layer(Band("NIR", path, 1, 80, 60, "uint16", saturation_value=65535.0), mapping)
-        values.append(resample_tile(layer.band, mapping, GRID.tile, interpolation)[0].astype(float))
+        values.append(resample_tile(layer.band, mapping, GRID, interpolation)[0].astype(float))
     bright = Layer(replace(layer.band, path=tmp_path / "65535.tif"), mapping)
     is_flagged = (flags_of(bright, interpolation=interpolation) & Quality.SATURATED) > 0
     is_changed = values[0] != values[1]
@@ -162,7 +162,7 @@ def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     mapping = PixelMapping(geometry.identity(), lens_of_reference, lens_of_reference)
     alignment = aligned(mapping, size_px, residual=residual, error=error)
     raw, undistorted = OutputGrid(0, 0, *size_px), OutputGrid(0, 0, *size_px, undistorted=True)
-    on_raw, on_undistorted = (error_map(alignment, reference, g).on_tile(g.tile) for g in (raw, undistorted))
+    on_raw, on_undistorted = (error_map(alignment, reference, g).on_tile(g) for g in (raw, undistorted))
     pixels = np.stack(np.meshgrid(*(np.arange(n) for n in size_px)), axis=-1)
     at = lens.distort(lens_of_reference, pixels).astype(np.float32)
     inside = ((at > 20) & (at < np.subtract(size_px, 20))).all(axis=-1)
