@@ -18,7 +18,6 @@ The JPEG has a column for each band of the sidecar, in its order, and these rows
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -54,13 +53,8 @@ def preview_bytes(captures: int) -> int:
     return min(600_000, 44_000_000 // max(captures, 1))
 
 
-class ReliefView(NamedTuple):
-    """The relief of a capture, reduced to the size of a tile."""
-
-    parallax_px: NDArray[np.float32]
-    """(height, width)"""
-    range_m: tuple[float, float] | None
-    """1st and 99th percentile of the range; None if it is unknown."""
+ReliefTile = tuple[Grey, ReliefPreviewPart]
+"""The relief of a capture, white for the nearest, and the limits of its greys."""
 
 
 class Preview(Product):
@@ -78,13 +72,13 @@ class Preview(Product):
         mapped = context.with_pixels if context.settings.write.error_map else {}
         errors_px = {name: error_lattice_px(a, reference, context.grid, NODES_PX) for name, a in mapped.items()}
         part = write_preview(
-            context.reduced_bands, bands, errors_px, path, preview_bytes(context.options.captures), relief_view(context)
+            context.reduced_bands, bands, errors_px, path, preview_bytes(context.options.captures), _relief_of(context)
         )
         return [WrittenFile(self.kind, path, preview=part)]
 
 
-def relief_view(context: ProductContext) -> ReliefView | None:
-    """Return the reduced relief of a capture; None if no band is displaced by one."""
+def _relief_of(context: ProductContext) -> ReliefTile | None:
+    """The relief of a capture, with the size of a tile; None if no band is displaced by one."""
     relief = relief_of(context.with_pixels)
     if relief is None:
         return None
@@ -93,7 +87,15 @@ def relief_view(context: ProductContext) -> ReliefView | None:
     layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, size_px)
     range_m = layers["range"][np.isfinite(layers["range"])]
     limits_m = tuple(np.percentile(range_m, _RELIEF_PERCENTILES).tolist()) if range_m.size else None
-    return ReliefView(layers["parallax"], limits_m)
+    return relief_tile(layers["parallax"], limits_m)
+
+
+def relief_tile(parallax_px: NDArray[np.float32], range_m: tuple[float, float] | None) -> ReliefTile:
+    """Return the tile of a parallax (height, width), and its limits with those of the range if it is known."""
+    low, high = np.percentile(parallax_px, _RELIEF_PERCENTILES).tolist()
+    high = max(high, low + 1e-3)
+    tile = np.rint(((parallax_px - low) / (high - low)).clip(0, 1) * 255).astype(np.uint8)
+    return tile, ReliefPreviewPart(parallax_px=(low, high), range_m=range_m)
 
 
 def write_preview(
@@ -102,7 +104,7 @@ def write_preview(
     errors_px: Mapping[str, NDArray[np.float32]],
     path: Path,
     max_bytes: int,
-    relief: ReliefView | None = None,
+    relief: ReliefTile | None = None,
 ) -> PreviewPart:
     """Write the preview, with tiles as large as `max_bytes` allows.
 
@@ -137,7 +139,7 @@ def _sheet(
     views: ReducedBands,
     bands: Sequence[str],
     errors_px: Mapping[str, NDArray[np.float32]],
-    relief: ReliefView | None,
+    relief: ReliefTile | None,
     scale: float,
     name: str,
 ) -> tuple[PreviewPart, Grey]:
@@ -155,10 +157,8 @@ def _sheet(
     if errors_px:
         errors = {n: np.nan_to_num(e / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255 for n, e in errors_px.items()}
         pictures["error"] = [_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands]
-    relief_part = None
     if relief is not None:
-        grey, relief_part = _relief_tile(relief)
-        pictures["relief"] = [_resized(grey, tile_px)]
+        pictures["relief"] = [_resized(relief[0], tile_px)]
     # Like the picture of the index of the aligned bands, which is not smoothed either.
     nearest = partial(cv2.resize, dsize=tile_px, interpolation=cv2.INTER_NEAREST)
     pictures["indices"] = [nearest(image) for image in views.indices_before.values()]
@@ -168,7 +168,7 @@ def _sheet(
         detail_px=detail_px,
         detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
         error_full_px=ERROR_FULL_PX if errors_px else None,
-        relief=relief_part,
+        relief=None if relief is None else relief[1],
         indices=list(views.indices_before),
     )
     strips = {row: np.hstack(images) for row, images in pictures.items() if images}
@@ -177,13 +177,6 @@ def _sheet(
     for row, (top, _, row_height) in part.rows.items():
         sheet[top : top + row_height, : strips[row].shape[1]] = strips[row]
     return part, sheet
-
-
-def _relief_tile(relief: ReliefView) -> tuple[Grey, ReliefPreviewPart]:
-    low, high = np.percentile(relief.parallax_px, _RELIEF_PERCENTILES).tolist()
-    high = max(high, low + 1e-3)
-    grey = np.rint(((relief.parallax_px - low) / (high - low)).clip(0, 1) * 255)
-    return np.asarray(grey, np.uint8), ReliefPreviewPart(parallax_px=(low, high), range_m=relief.range_m)
 
 
 def _whole_blocks(length_px: float, max_px: int) -> int:

@@ -14,7 +14,7 @@ import tifffile
 import agalign
 from agalign.config import Settings, WriteSettings
 from agalign.rasters.drawing import ReducedBands
-from agalign.rasters.preview import ReliefView, preview_bytes, write_preview
+from agalign.rasters.preview import preview_bytes, relief_tile, write_preview
 from agalign.report import facts
 from agalign.report.pages import write_pages
 from agalign.synthetic import flight as synthetic
@@ -381,7 +381,7 @@ def test_the_relief_over_the_picture(browser: Any, out: Path, tmp_path: Path) ->
     sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
     black, bands = np.zeros((360, 480), np.uint8), [b["band"] for b in sidecar["bands"]]
     views = ReducedBands(dict.fromkeys(bands, black), dict.fromkeys(bands, black), (480, 360))
-    relief = ReliefView(np.where(np.arange(480) < 240, -2.0, 6.0)[None].repeat(360, axis=0).astype(np.float32), (1, 2))
+    relief = relief_tile(np.where(np.arange(480) < 240, -2.0, 6.0)[None].repeat(360, axis=0).astype(np.float32), (1, 2))
     for name, errors in (("a", {}), ("b", {"NIR": np.ones((4, 5), np.float32)})):
         part = write_preview(views, bands, errors, tmp_path / f"{name}.preview.jpg", preview_bytes(1), relief)
         sidecar |= {"capture": name, "preview": part.model_dump(mode="json")}

@@ -19,7 +19,7 @@ import pytest
 import agalign
 from agalign.config import Settings
 from agalign.rasters.drawing import ReducedBands, read_reduced_bands
-from agalign.rasters.preview import ReliefView, preview_bytes, write_preview
+from agalign.rasters.preview import preview_bytes, relief_tile, write_preview
 from agalign.records.run_record import begun
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
@@ -543,7 +543,7 @@ def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_p
     parallax_px = np.linspace(-3, 7, 320, dtype=np.float32)[None].repeat(240, axis=0)
     parallax_px[:2, :2] = 1000.0  # wrong pixels take no contrast
     errors = {"NIR": np.full((4, 5), 1.5, np.float32)} if has_errors else {}
-    relief = ReliefView(parallax_px, (1.23456, 2.5))
+    relief = relief_tile(parallax_px, (1.23456, 2.5))
     part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1), relief)
     sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
     (w, h), (dw, dh) = part.tile_px, part.detail_px
