@@ -25,7 +25,7 @@ from agalign.flight.fingerprint import joined_options, render_fingerprint
 from agalign.flight.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.aligned_files import BandFiles, Stack
-from agalign.rasters.alignment_maps import ReliefMap, moved_share, share_over_1_px
+from agalign.rasters.alignment_maps import ReliefMap, error_shares
 from agalign.rasters.output_grid import output_layers
 from agalign.rasters.product import CapturePaths, LostFile, ProductContext, RenderOptions, WrittenFile
 from agalign.records.sidecar import (
@@ -189,7 +189,7 @@ def _bands(context: ProductContext) -> list[BandResult]:
             facts["place"] = PlacePart(file=context.paths.relative(place[0].path), band_index=place[1])
             if band.band in context.with_pixels:
                 of_band = context.with_pixels[band.band], context.capture.reference, context.grid
-                facts |= {"share_over_1_px": share_over_1_px(*of_band), "moved_share": moved_share(*of_band)}
+                facts["share_over_1_px"], facts["moved_share"] = error_shares(*of_band)
         if band.relief is not None:
             facts["relief"] = band.relief.model_copy(update={"file": relief})
         result.append(band.model_copy(update=facts))

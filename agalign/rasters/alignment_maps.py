@@ -74,20 +74,16 @@ def error_lattice_px(alignment: Alignment, reference: Band, grid: OutputGrid, st
     return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
 
 
-def share_over_1_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> float:
-    """Return the share of a grid where the expected error exceeds 1 px, or is unknown, as the quality raster flags."""
-    error = error_map(alignment, reference, grid)
-    if error is not None and error.error.moved:  # a lattice would miss most of a small area
-        return float((error.on_tile(Tile(0, 0, grid.width, grid.height)) > MAX_PIXEL_ERROR_PX).mean())
-    error_px = error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX)
-    return float((~(error_px <= MAX_PIXEL_ERROR_PX)).mean())
-
-
-def moved_share(alignment: Alignment, reference: Band, grid: OutputGrid) -> float:
-    """Return the share of a grid in areas that moved, as the quality raster flags them."""
-    has_areas = alignment.error is not None and alignment.error.moved  # a map takes 10 ms
-    error = error_map(alignment, reference, grid) if has_areas else None
-    return 0.0 if error is None else float((error.moved_px(Tile(0, 0, grid.width, grid.height)) > 0).mean())
+def error_shares(alignment: Alignment, reference: Band, grid: OutputGrid) -> tuple[float, float]:
+    """Return the share of a grid where the expected error exceeds 1 px, or is unknown, and that of areas that moved,
+    as the quality raster flags them.
+    """
+    error = error_map(alignment, reference, grid) if alignment.error is not None and alignment.error.moved else None
+    if error is None:
+        error_px = error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX)
+        return float((~(error_px <= MAX_PIXEL_ERROR_PX)).mean()), 0.0
+    whole = Tile(0, 0, grid.width, grid.height)  # a lattice would miss most of a small area
+    return float((error.on_tile(whole) > MAX_PIXEL_ERROR_PX).mean()), float((error.moved_px(whole) > 0).mean())
 
 
 def _error_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import rasterio
 
 import agalign
 from agalign.pixels.band_resampling import resample_tile
-from agalign.rasters.alignment_maps import _flags, error_map, moved_share, share_over_1_px
+from agalign.rasters.alignment_maps import _flags, error_map, error_shares
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import bands_of
 from agalign.records.sidecar_file import read_checked
@@ -129,12 +129,11 @@ def test_areas_that_moved_are_flagged_and_have_their_shift_as_error_on_every_gri
     assert np.array_equal(flags & Quality.ERROR_OVER_1_PX > 0, expected)
     np.testing.assert_allclose(error.on_tile(Tile(0, 0, 60, 40)), np.where(expected, np.hypot(5, 0.1), 0.1), rtol=1e-5)
     assert UNUSABLE_QUALITY & Quality.MOVED
-    for share in (moved_share, share_over_1_px):
-        assert share(alignment, reference, GRID) == expected.mean()
+    assert error_shares(alignment, reference, GRID) == (expected.mean(), expected.mean())
     double = OutputGrid(0, 0, 160, 120, PixelScale(2.0, 2.0))
-    assert moved_share(alignment, reference, double) == pytest.approx(400 / 4800)
+    assert error_shares(alignment, reference, double)[1] == pytest.approx(400 / 4800)
     still = aligned(PixelMapping(geometry.identity()), size_px, error=MappingError(size_px))
-    assert moved_share(still, reference, GRID) == 0.0
+    assert error_shares(still, reference, GRID) == (0.0, 0.0)
 
 
 def test_an_area_that_moved_is_where_an_undistorted_grid_shows_it() -> None:

@@ -13,7 +13,7 @@ from agalign.cameras.discover import discover
 from agalign.cameras.metadata import exposed_after_s
 from agalign.cli.terminal import Terminal, explain
 from agalign.flight.rig_file import model_fingerprint
-from agalign.rasters.alignment_maps import error_lattice_px, share_over_1_px
+from agalign.rasters.alignment_maps import error_lattice_px, error_shares
 from agalign.records.cautions import Caution, RunFacts
 from agalign.records.panels_and_sky import PanelPart
 from agalign.records.sidecar import Sidecar
@@ -301,7 +301,7 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
     seed, error = Seed("rig", np.eye(3), 9.0), MappingError(size_px, residual=residual)
     alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), seed, residual=residual, error=error)
     reference, grid = Band("Green", Path("a.tif"), 1, *size_px, "uint16"), OutputGrid(0, 0, *size_px)
-    share = share_over_1_px(alignment, reference, grid)
+    share, _ = error_shares(alignment, reference, grid)
     assert share == pytest.approx((error_lattice_px(alignment, reference, grid, 16) > 1).mean(), abs=0.03)
     assert 0.1 < share < 0.2
 
