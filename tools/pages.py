@@ -57,7 +57,7 @@ def command_options() -> str:
     """Return a section per command: what it does, its usage, and a list of options for each panel of its help. Options
     that `align` has with the same text are described there only.
     """
-    return "\n".join(section(c) for c in COMMANDS.values() if not c.alias and c.name not in EXPERIMENTS)
+    return "\n".join(section(c) for name, c in COMMANDS.items() if name == c.name and name not in EXPERIMENTS)
 
 
 EXPERIMENTS = ("evaluate", "surface", "learn")

@@ -137,13 +137,11 @@ class Command:
     on_interrupt: str = "interrupted"
     panel: str | None = None
     """Panel in the list of commands."""
-    alias: str = ""
-    """Second name of a command, which the list of commands leaves out."""
 
     @property
     def name(self) -> str:
         """Its name on the command line."""
-        return self.alias or self.function.__name__.removeprefix("_")
+        return self.function.__name__.removeprefix("_")
 
     @property
     def summary(self) -> str:
@@ -188,7 +186,7 @@ class Command:
         app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
         cls = _LenientCommand if fields else _Command
         epilog = "\n\n".join(["Examples:", *map(_highlighted, examples)]) if examples else None
-        app.command(self.name, cls=cls, epilog=epilog, hidden=bool(self.alias))(call)
+        app.command(self.name, cls=cls, epilog=epilog)(call)
         return typer.main.get_command(app)
 
 

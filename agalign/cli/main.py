@@ -4,7 +4,6 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,9 +19,8 @@ from agalign.cli.terminal import ExitCode, Terminal, options_from, printed
 from agalign.host.processes import leave_out_network_clients, limit_default_threads, silence_libraries
 from agalign.host.text import did_you_mean, name_problem
 
-ndvi = replace(indices, alias="ndvi")
-_ALL = align, demo, info, report, verify, indices, ndvi, export, onto, evaluate, surface, learn
-COMMANDS = {command.name: command for command in _ALL}
+_LISTED = align, demo, info, report, verify, indices, export, onto, evaluate, surface, learn
+COMMANDS = {command.name: command for command in _LISTED} | {"ndvi": indices}  # a second name of a command
 _UsageError: Any = typer.BadParameter.__mro__[1]
 """The class of click, or of the copy of click in typer."""
 
@@ -42,9 +40,9 @@ class RootGroup(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         """Write a section of commands for each panel."""
-        for panel in dict.fromkeys(command.panel for command in _ALL):
+        for panel in dict.fromkeys(command.panel for command in _LISTED):
             with formatter.section(panel or "Commands"):
-                formatter.write_dl([(c.name, c.summary) for c in _ALL if c.panel == panel and not c.alias])
+                formatter.write_dl([(c.name, c.summary) for c in _LISTED if c.panel == panel])
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         """Write the examples."""
