@@ -11,7 +11,7 @@ import numpy as np
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.gdal import gdal_name, without_warnings
-from agalign.rasters.alignment_maps import RELIEF_UNITS
+from agalign.rasters.alignment_maps import RELIEF_UNITS, ReliefMap
 from agalign.rasters.band_reader import like_most
 from agalign.records.captures import RunCapture, captures_of_run, differing_from_most
 from agalign.records.listed_files import ListedFiles
@@ -70,7 +70,7 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
         raise InputError(f"{given}: is a folder; give the sidecar of a capture, or use open_flight")
     name = re.sub(r"\.json$|\.tiff?$", "", given.name, flags=re.IGNORECASE)
     sidecar = given.with_name(f"{name}.json")
-    return _dataset(sidecar, ListedFiles.of(read_sidecar(sidecar), sidecar.parent), masked=masked)
+    return _dataset(RunCapture(name, sidecar, read_sidecar(sidecar)), masked=masked)
 
 
 @checked
@@ -111,7 +111,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """
     xr = import_xarray()
     captures = _captures_with_output(Path(out))
-    opened = [_dataset(c.path, c.listed, masked=masked) for c in captures]
+    opened = [_dataset(c, masked=masked) for c in captures]
     common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
     # In pixels: the map coordinates of the captures differ.
     in_pixels = [_in_pixels(one[common]) for one in opened]
@@ -165,11 +165,10 @@ def import_xarray() -> Any:
     return xr
 
 
-def _dataset(path: Path, listed: ListedFiles, *, masked: bool) -> "xarray.Dataset":
-    """The dataset of the capture with the sidecar at `path`, and its files as they are listed there."""
-    xr, sidecar, folder = import_xarray(), read_sidecar(path), path.parent
+def _dataset(capture: RunCapture, *, masked: bool) -> "xarray.Dataset":
+    xr, sidecar, folder = import_xarray(), capture.result, capture.path.parent
     if sidecar.output is None:
-        raise InputError(f"{path}: its capture has no aligned pixels; look at the report of the run")
+        raise InputError(f"{capture.path}: its capture has no aligned pixels; look at the report of the run")
     files: dict[str, xarray.DataArray] = {}
     result = {}
     for band in sidecar.bands:
@@ -177,11 +176,10 @@ def _dataset(path: Path, listed: ListedFiles, *, masked: bool) -> "xarray.Datase
             continue
         name = band.place.file
         if name not in files:
-            files[name] = _opened(folder / name, listed, masked=masked)
+            files[name] = _opened(folder / name, capture.listed, masked=masked)
         result[band.band] = _variable(files[name], band, band.place.band_index, name, masked=masked)
-    relief = next((b.relief.file for b in sidecar.bands if b.relief is not None and b.relief.file), None)
-    if relief is not None:
-        layers = _opened(folder / relief, listed, masked=True)
+    for relief in (path for path, part in capture.listed.parts.items() if part.kind == ReliefMap.kind):
+        layers = _opened(relief, capture.listed, masked=True)
         for index, name in enumerate(np.atleast_1d(layers.attrs.get("long_name", "parallax"))):
             one = layers.isel(band=index, drop=True)
             result[str(name)] = one.assign_attrs(long_name=str(name), units=RELIEF_UNITS[name])

@@ -150,6 +150,7 @@ def test_the_raster_of_the_relief(run: Run, written: Path) -> None:
     for name, unit in units.items():
         np.testing.assert_array_equal(dataset[name].values, layers[name])
         assert (dataset[name].attrs["units"], dataset[name].attrs["long_name"]) == (unit, name)
+    assert set(agalign.open_flight(written.parent).data_vars) == set(dataset.data_vars)
     (product,) = (p for p in read_sidecar(written).products if p.kind == "relief")
     assert (product.file, product.bytes) == (path.name, path.stat().st_size)
 
