@@ -102,26 +102,28 @@ def is_in_range(band: Band, pan: Sequence[Band]) -> bool:
     return low <= band.wavelength_nm <= high
 
 
-def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> NDArray[np.float64]:
-    """Return the weight of each band (height, width) in the panchromatic band, whose pixels are `scale` times smaller.
+def weights_of(bands: FloatImage, pan: FloatImage, scale: float) -> NDArray[np.float64]:
+    """Return the weight of each band (bands, height, width) in the panchromatic band, whose pixels are `scale` times
+    smaller.
 
     Non-negative least squares over the pixels that are not nan; equal weights if the fit is impossible.
     """
     sigma_px = max(0.5 * scale, 0.3)  # the bands may have almost the resolution of the panchromatic band
     blurred = cv2.GaussianBlur(np.nan_to_num(pan), (0, 0), sigma_px)
-    known = np.isfinite(pan) & np.logical_and.reduce([np.isfinite(b) for b in bands])
+    known = np.isfinite(pan) & np.isfinite(bands).all(axis=0)
     if known.any():
-        design = np.stack([b[known] for b in bands], axis=-1).astype(np.float64)
-        result, _ = nnls(design, blurred[known].astype(np.float64))
+        result, _ = nnls(bands[:, known].T.astype(np.float64), blurred[known].astype(np.float64))
         if result.any():
             return np.asarray(result)
     return np.full(len(bands), 1 / len(bands))
 
 
-def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[np.float64]) -> FloatImage:
-    """Return P / sum w B (height, width), limited to 1 / 5 to 5; 1 where it is undefined."""
+def brovey_ratio(bands: FloatImage, pan: FloatImage, weights: NDArray[np.float64]) -> FloatImage:
+    """Return P / sum w B (height, width) of bands (bands, height, width), limited to 1 / 5 to 5; 1 where it is
+    undefined.
+    """
     max_ratio = 5.0  # in dark pixels it is noise divided by noise
-    weighted_sum = np.tensordot(weights, np.stack(bands), axes=1)
+    weighted_sum = np.tensordot(weights, bands, axes=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(weighted_sum > 0, pan / weighted_sum, 1.0)
     return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / max_ratio, max_ratio), np.float32)
@@ -138,8 +140,7 @@ def sharpened(
     radiometry = [b.radiometry if is_raw else None for b in (*bands, *pan)]
     without_light = np.array([0.0 if r is None else r.black_level for r in radiometry], np.float32)
     without_light -= np.divide(file.offsets, file.scales).astype(np.float32)
-    is_sharpened = [is_in_range(band, pan) for band in bands]
-    in_range = np.flatnonzero(is_sharpened)
+    in_range = [k for k, band in enumerate(bands) if is_in_range(band, pan)]
 
     def read(tile: Tile) -> tuple[FloatImage, Mask]:
         """((bands, height, width) above the number without light, nan for nodata; mask of valid pixels)."""
@@ -149,23 +150,22 @@ def sharpened(
 
     width, height = min(file.width, _TILE_PX), min(file.height, _TILE_PX)
     light, _ = read(Tile((file.width - width) // 2, (file.height - height) // 2, width, height))
-    weights = weights_of([*light[in_range]], light[count:].mean(axis=0), scale)
+    weights = weights_of(light[in_range], light[count:].mean(axis=0), scale)
 
     def blocks() -> Iterator[Block]:
         for tile in tiles(Tile(0, 0, file.width, file.height), _TILE_PX):
             light, valid = read(tile)
-            ratio = brovey_ratio([*light[in_range]], light[count:].mean(axis=0), weights)
+            light[in_range] *= brovey_ratio(light[in_range], light[count:].mean(axis=0), weights)
             for k in range(count):
-                values = (light[k] * ratio if is_sharpened[k] else light[k]) + without_light[k]
+                values = light[k] + without_light[k]
                 pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
                 yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
-    source, texts = "the colour photograph" if pan[0].is_from_photograph else pan[0].name, ["no"] * count
-    for k, weight in zip(in_range, weights.tolist(), strict=True):
-        texts[k] = f"weighted Brovey by {source}, weight {weight:.4g}"
-    result = []
-    for number, (band, unit, text) in enumerate(zip(bands, file.units, texts, strict=False), start=1):
-        tags, imagery = file.tags(number) | {"PANSHARPENED": text}, file.tags(number, ns="IMAGERY")
-        values = file.scales[number - 1], file.offsets[number - 1]
-        result.append(LayerDescription(band.name, unit or "", tags, imagery, values))
+    source = "the colour photograph" if pan[0].is_from_photograph else pan[0].name
+    weight_of, result = dict(zip(in_range, weights.tolist(), strict=True)), []
+    for k, band in enumerate(bands):
+        text = f"weighted Brovey by {source}, weight {weight_of[k]:.4g}" if k in weight_of else "no"
+        tags, imagery = file.tags(k + 1) | {"PANSHARPENED": text}, file.tags(k + 1, ns="IMAGERY")
+        values = file.scales[k], file.offsets[k]
+        result.append(LayerDescription(band.name, file.units[k] or "", tags, imagery, values))
     return result, blocks()

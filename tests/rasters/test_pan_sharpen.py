@@ -21,19 +21,19 @@ from ..run_outputs import aligned, context_of
 pytestmark = pytest.mark.slow
 
 
-def scene() -> tuple[list[np.ndarray], np.ndarray]:
+def scene() -> tuple[np.ndarray, np.ndarray]:
     """Two bands of half the resolution, brought to that of the panchromatic that is made of them."""
     fine = [2000 + 300 * textured_image(320, 240, seed) for seed in (1, 2)]
     coarse = [cv2.resize(cv2.resize(f, (160, 120), interpolation=cv2.INTER_AREA), (320, 240)) for f in fine]
-    return coarse, (0.7 * fine[0] + 0.2 * fine[1]).astype(np.float32)
+    return np.stack(coarse), (0.7 * fine[0] + 0.2 * fine[1]).astype(np.float32)
 
 
 def test_weights_are_those_that_the_panchromatic_is_made_with() -> None:
     bands, pan = scene()
     np.testing.assert_allclose(weights_of(bands, pan, 2.0), [0.7, 0.2], atol=0.03)
-    missing = [np.where(np.arange(320) < 50, np.float32(np.nan), b) for b in bands]
+    missing = np.where(np.arange(320) < 50, np.float32(np.nan), bands)
     np.testing.assert_allclose(weights_of(missing, pan, 2.0), [0.7, 0.2], atol=0.04)
-    nothing = [np.full_like(b, np.nan) for b in bands]
+    nothing = np.full_like(bands, np.nan)
     np.testing.assert_allclose(weights_of(nothing, pan, 2.0), [0.5, 0.5])
 
 
@@ -53,7 +53,7 @@ def test_the_result_equals_that_of_gdal(tmp_path: Path) -> None:
     with rasterio.open(vrt) as file:
         expected = file.read()
     ratio = brovey_ratio(bands, pan, np.array([0.7, 0.2]))
-    np.testing.assert_allclose(np.stack(bands) * ratio, expected, rtol=1e-4)
+    np.testing.assert_allclose(bands * ratio, expected, rtol=1e-4)
 
 
 @pytest.mark.full
