@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -92,10 +91,8 @@ def grey(plane: NDArray[np.float32]) -> Grey:
     sample = plane.ravel()[:: max(1, plane.size // sample_pixels)]
     sample = sample[np.isfinite(sample) & (sample != 0)]
     low, high = np.percentile(sample, (1.5, 98.5)).tolist() if sample.size else (0.0, 1.0)
-    scaled = np.subtract(plane, np.float32(low))
-    scaled *= np.float32(255.0 / max(high - low, 1e-9))
-    cv2.patchNaNs(scaled, 0.0)
-    return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
+    scaled = (plane - np.float32(low)) * np.float32(255.0 / max(high - low, 1e-9))
+    return np.asarray(np.nan_to_num(scaled).clip(0, 255), np.uint8)
 
 
 def write_png(image: Picture, path: Path) -> None:
