@@ -83,10 +83,8 @@ def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str 
     """Return a parameter, which may have an option of typer as annotation, as one of the command line in a panel of
     its help. The help text replaces that of the annotation. The help shows the kind of value as `value_name` names it.
     """
-    kind, info = parameter.annotation, typer.Option()
-    if kind is bool:
-        info = typer.Option(f"--{parameter.name.replace('_', '-')}")  # without --no-…
-    elif get_origin(kind) is Annotated:
+    kind, info = parameter.annotation, typer.Option(f"--{parameter.name.replace('_', '-')}")  # without --no-…
+    if get_origin(kind) is Annotated:
         kind, info = get_args(kind)
     info = copy.copy(info)
     info.help, info.rich_help_panel = text or info.help, panel
@@ -220,9 +218,8 @@ class _LenientCommand(_Command):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, after options get their missing values."""
-        own = {param.name for param in self.params}
         for option in field_options().values():
-            if option.alone and option.name in own:
+            if option.alone:
                 args = _completed(args, option)
         return super().parse_args(ctx, args)
 
