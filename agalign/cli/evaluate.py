@@ -41,7 +41,7 @@ def _evaluate(
         seeding: Correct the start by the initial alignment first, as a run does.
         out: CSV file with a row per pair, method and start; rows that it has are not measured again.
     """
-    from agalign.evaluation.evaluate import Starts, append_result, error_table, evaluate, method_named, precision_table
+    from agalign.evaluation.evaluate import Starts, error_table, evaluate, method_named, precision_table, write_results
     from agalign.evaluation.image_pairs import find_pairs
 
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
@@ -53,7 +53,7 @@ def _evaluate(
     for result in evaluate(known, named, every, joint["rng_seed"], results.copy()):
         results.append(result)
         if out is not None:
-            append_result(out, result)
+            write_results(out, results)
         text = f"mAP {result.average_precision:.3f}, {result.error_px:.3f} px, {result.seconds:.1f} s"
         line = f"[{numbers[result.pair]}/{len(known)}] {result.pair}, {result.method}, {result.shift:.1%} off: {text}"
         terminal.event("result", line, **vars(result))

@@ -30,14 +30,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
 from agalign.capture.seeding import best_seed, image_groups
 from agalign.config import JointSettings
-from agalign.errors import (
-    ConfigurationError,
-    GeometryError,
-    InputError,
-    NoContrastError,
-    NotEnoughTextureError,
-    OutputError,
-)
+from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.ecc import homography_by_ecc
 from agalign.evaluation.image_pairs import PairFiles, read_image
 from agalign.flight.model import load_model
@@ -424,15 +417,6 @@ def read_results(path: Path) -> list[Result]:
 def write_results(path: Path, results: Sequence[Result]) -> None:
     """Write the results as CSV, one row per result. Raises OutputError."""
     write_csv(path, _COLUMNS, (result.cells for result in results))
-
-
-def append_result(path: Path, result: Result) -> None:
-    """Add a row to a table of `write_results`. Raises OutputError."""
-    try:
-        with path.open("a", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerow(map(without_formula, result.cells))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 def precision_table(results: Sequence[Result]) -> list[list[str]]:
