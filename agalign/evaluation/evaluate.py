@@ -404,8 +404,8 @@ def read_results(path: Path) -> list[Result]:
         return []
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: cannot be read ({error}); choose another name with -o") from None
-    header, *rows = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
     try:
+        header, *rows = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
         if header != _COLUMNS:
             raise ValueError
         kinds = [f.type for f in fields(Result)]

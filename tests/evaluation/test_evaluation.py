@@ -215,6 +215,13 @@ def test_matching_finds_nothing_in_unrelated_images() -> None:
 # ---- the commands
 
 
+@pytest.mark.parametrize("text", ["pair,group,method", "pair,group,method,shift\n"])
+def test_a_table_of_another_version_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "rows.csv").write_text(text)
+    with pytest.raises(ConfigurationError, match=r"rows\.csv: is not a table of this version"):
+        evaluation.read_results(tmp_path / "rows.csv")
+
+
 @pytest.mark.full
 def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_path: Path) -> None:
     write_pair(tmp_path, TRUTH, 3)
