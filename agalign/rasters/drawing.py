@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
-from agalign.errors import UnreadableFileError
+from agalign.errors import OutputError, UnreadableFileError
 from agalign.host.files import complete_file
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE
@@ -98,19 +98,22 @@ def grey(plane: NDArray[np.float32]) -> Grey:
 def write_png(image: Picture, path: Path) -> None:
     """Write a picture atomically, in the format of the path's suffix. Raises OutputError."""
     with complete_file(path) as partial:
-        partial.write_bytes(encoded(image, path.suffix))
+        partial.write_bytes(encoded(image, path))
 
 
-def encoded(image: Picture | Grey, suffix: str, quality: int = 95) -> bytes:
-    """Return an image in the format of a suffix, with the name of the program, by which later commands recognise it.
-    `quality` is that of a JPEG.
+def encoded(image: Picture | Grey, path: Path, quality: int = 95) -> bytes:
+    """Return an image in the format of the path's suffix, with the name of the program, by which later commands
+    recognise it. `quality` is that of a JPEG. Raises OutputError for one that is too large for its format.
     """
     name, file = PngInfo(), io.BytesIO()
     name.add_text("Software", SOFTWARE)
     # Each format uses those of these options that it knows. Higher levels of compression take longer and gain little.
     options: dict[str, Any] = {"pnginfo": name, "comment": SOFTWARE, "software": SOFTWARE, "compress_level": 1}
-    format_name = Image.registered_extensions()[suffix.lower()]
-    Image.fromarray(image).save(file, format_name, quality=quality, **options)
+    format_name = Image.registered_extensions()[path.suffix.lower()]
+    try:
+        Image.fromarray(image).save(file, format_name, quality=quality, **options)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be encoded ({error})") from None
     return file.getvalue()
 
 

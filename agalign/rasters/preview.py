@@ -120,13 +120,13 @@ def write_preview(
 
     first = next(images[name] for name in bands for images in (views.after, views.before) if name in images)
     size_px = reduced_size_px(views.size_px, longest_px / tile_px)
-    of_tile = len(encoded(_resized(first, size_px), path.suffix, _JPEG_QUALITY))
+    of_tile = len(encoded(_resized(first, size_px), path, _JPEG_QUALITY))
     of_all = 2 * len(bands) * of_tile * (1 + _DETAIL_SHARE**2)
     if of_all > max_bytes:
         tile_px = smaller_px(of_all)
     for _ in range(6):  # one step is usually sufficient
         part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
-        data = encoded(sheet, path.suffix, _JPEG_QUALITY)
+        data = encoded(sheet, path, _JPEG_QUALITY)
         if len(data) <= max_bytes or tile_px <= min_tile_px:
             break
         tile_px = smaller_px(len(data))

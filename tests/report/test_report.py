@@ -18,6 +18,7 @@ import pytest
 
 import agalign
 from agalign.config import Settings
+from agalign.errors import OutputError
 from agalign.rasters.drawing import ReducedBands, read_reduced_bands
 from agalign.rasters.preview import preview_bytes, relief_tile, write_preview
 from agalign.records.run_record import begun
@@ -584,6 +585,12 @@ def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> Non
     part = write_preview(ReducedBands(tiny, tiny, (60, 41)), ["Green", "NIR"], {}, tmp_path / "a.preview.jpg", 10_000)
     assert part.tile_px == (56, 40)
     assert max(part.detail[2:]) <= 1
+
+
+def test_a_preview_that_is_too_wide_for_its_format_is_a_product_that_failed(tmp_path: Path) -> None:
+    names, blank = [f"B{number}" for number in range(1100)], np.zeros((48, 64), np.uint8)
+    with pytest.raises(OutputError, match=r"a\.preview\.jpg: cannot be encoded"):
+        write_preview(ReducedBands(dict.fromkeys(names, blank), {}, (64, 48)), names, {}, tmp_path / "a.preview.jpg", 9)
 
 
 # ---- failed bands, grouped by their cause
