@@ -269,12 +269,11 @@ def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -
     except RuntimeError:
         return None
     table = result.GetParameterMap(0)
-    a, b, c, d, tx, ty = (float(v) for v in table["TransformParameters"])
-    centre = np.array([float(v) for v in table["CenterOfRotationPoint"]])
-    linear = np.array([[a, b], [c, d]])
-    matrix = np.eye(3)
-    matrix[:2, :2], matrix[:2, 2] = linear, np.array([tx, ty]) + centre - linear @ centre
-    return matrix
+    a, b, c, d, x, y = map(float, table["TransformParameters"])
+    centre_x, centre_y = map(float, table["CenterOfRotationPoint"])
+    about_centre = np.array([[a, b, x], [c, d, y], [0.0, 0.0, 1.0]])
+    to_centre, back = geometry.translation(-centre_x, -centre_y), geometry.translation(centre_x, centre_y)
+    return geometry.compose(back, about_centre, to_centre)
 
 
 def grey_patches(raster: Raster, grid: Tensor) -> Tensor:
