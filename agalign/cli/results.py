@@ -208,9 +208,24 @@ def _indices(
 
 
 def _print_statistics(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
-    """Print the statistics of all indices, and what to check in them."""
-    written = [r for r in reports if r.path is not None]
-    _print_table(names, reports, terminal)
+    """Print a row per index, statistics of the medians of its captures, and what to check in them."""
+    from statistics import median
+
+    from agalign.records.captures import differing_from_most
+
+    written, rows = [r for r in reports if r.path is not None], []
+    for name in names:
+        of_index = [r for r in written if r.index == name and math.isfinite(r.median)]
+        differing = dict(differing_from_most({r.capture: (r.statistics.unit,) for r in of_index}))
+        for label, reason in differing.items():
+            terminal.problem(f"{label} {name}: not in the medians of captures: {reason}", capture=label)
+        values = [r.median for r in of_index if r.capture not in differing]
+        if values:
+            numbers = (median(values), min(values), max(values))
+            masked_share = median(r.statistics.masked_share for r in written if r.index == name)
+            rows.append((name, str(len(values)), *(f"{number:.3f}" for number in numbers), f"{masked_share:.1%}"))
+    title = f"{len(written)} of {len(reports)} written; medians of captures"
+    terminal.table(("Index", "Captures", "Median", "Lowest", "Highest", "Masked"), rows, title, texts=1)
     if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
         more = f" and {counted(len(masked) - 1, 'more capture')}" if masked[1:] else ""
         terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
@@ -251,24 +266,3 @@ def _facts(report: "IndexReport") -> dict[str, Any]:
         "kept": report.kept,
         "problem": report.problem or None,
     }
-
-
-def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
-    """Print a row per index: statistics of the medians of its captures."""
-    from statistics import median
-
-    from agalign.records.captures import differing_from_most
-
-    written, rows = [r for r in reports if r.path is not None], []
-    for name in names:
-        of_index = [r for r in written if r.index == name and math.isfinite(r.median)]
-        differing = dict(differing_from_most({r.capture: (r.statistics.unit,) for r in of_index}))
-        for label, reason in differing.items():
-            terminal.problem(f"{label} {name}: not in the medians of captures: {reason}", capture=label)
-        values = [r.median for r in of_index if r.capture not in differing]
-        if values:
-            numbers = (median(values), min(values), max(values))
-            masked = median(r.statistics.masked_share for r in written if r.index == name)
-            rows.append((name, str(len(values)), *(f"{number:.3f}" for number in numbers), f"{masked:.1%}"))
-    title = f"{len(written)} of {len(reports)} written; medians of captures"
-    terminal.table(("Index", "Captures", "Median", "Lowest", "Highest", "Masked"), rows, title, texts=1)
