@@ -12,7 +12,7 @@ from agalign.config import JointSettings
 from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.levels import make_level
-from agalign.method.paper import DEFAULT_TRAINING, Training, descend
+from agalign.method.paper import Training, descend
 from agalign.method.state import JointState, MovingImage
 from agalign.rasters.drawing import with_text, write_png
 from agalign.values import geometry
@@ -26,16 +26,15 @@ def loss_surface(
     truth: Matrix,
     offsets_px: NDArray[np.float64],
     settings: JointSettings,
-    training: Training = DEFAULT_TRAINING,
-    longer_side_px: int = 512,
+    training: Training,
     progress: Callable[[float], None] = lambda _: None,
 ) -> NDArray[np.float64]:
     """Return the mean loss per keypoint after training with psi fixed at the truth shifted by each (x, y): (n, n).
 
     Rows are along y; nan if too few keypoints remain. Each network is trained from the same random weights by recipe
-    paper, at the resolution with a longer side of at most `longer_side_px`. Offsets are px of the full resolution.
+    paper, at the resolution with a longer side of at most 512 px. Offsets are px of the full resolution.
     """
-    scale = min(1.0, longer_side_px / max(fixed.size_px))
+    scale = min(1.0, 512 / max(fixed.size_px))
     result = np.full((len(offsets_px), len(offsets_px)), np.nan)
     for row, dy in enumerate(offsets_px):
         for column, dx in enumerate(offsets_px):

@@ -104,7 +104,7 @@ def descend(
     net: Descriptor,
     level: Level,
     pool: Pool,
-    training: Training = DEFAULT_TRAINING,
+    training: Training,
     *,
     shares: tuple[float, float] = (0.0, 1.0),
     update_psi: bool = True,
