@@ -253,7 +253,7 @@ def _descriptions(context: ProductContext, layers: Sequence[Layer]) -> list[Laye
         quantity = None if raw or band.radiometry is None else band.radiometry.quantity
         # A band without calibration, as of a photograph, has not the quantity of the file.
         known = quantity or ("" if layer.is_gap else RAW)
-        tags, imagery = {"QUANTITY": known} if is_calibrated and known else {}, {}
+        tags = {"QUANTITY": known} if is_calibrated and known else {}
         if layer.is_gap:
             alignment = context.alignments.get(band.name)
             why_missing = str(context.capture.unreadable_bands.get(band.name, MISSING_BAND.cause))
@@ -261,12 +261,10 @@ def _descriptions(context: ProductContext, layers: Sequence[Layer]) -> list[Laye
             tags |= {"STATUS": status, "REASON": reason or why_missing}
         if band.wavelength_nm is not None:
             tags |= {"wavelength": f"{band.wavelength_nm:g}", "wavelength_units": "nm"}
-            imagery = {"CENTRAL_WAVELENGTH_UM": f"{band.wavelength_nm / 1000:g}"}
             if band.bandwidth_nm is not None:
                 tags["fwhm"] = f"{band.bandwidth_nm:g}"
-                imagery["FWHM_UM"] = f"{band.bandwidth_nm / 1000:g}"
         unit, scale_offset = "" if quantity is None else UNITS[quantity], band.scale_offset if raw else (1.0, 0.0)
-        result.append(LayerDescription(band.name, unit, tags, imagery, scale_offset, colour))
+        result.append(LayerDescription(band.name, unit, tags, scale_offset, colour))
     return result
 
 

@@ -34,7 +34,8 @@ from agalign.values.image import OutputGrid
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
 _ZSTD_LEVEL = 1
 """Higher levels take longer, and gain 2 %."""
-
+_IMAGERY = {"wavelength": "CENTRAL_WAVELENGTH_UM", "fwhm": "FWHM_UM"}
+"""Tags of GDAL's domain IMAGERY, micrometres, by the tag of a band in nanometres."""
 
 Block = tuple[NDArray[Any], int, int, int]
 """Pixels (height, width), band of the raster from 1, and position (x, y) of their top-left pixel in the raster."""
@@ -47,8 +48,7 @@ class LayerDescription:
     name: str
     unit: str = ""
     tags: Mapping[str, str] = field(default_factory=dict)
-    imagery: Mapping[str, str] = field(default_factory=dict)
-    """Tags of GDAL's domain IMAGERY."""
+    """Its wavelength and bandwidth are also written to GDAL's domain IMAGERY."""
     scale_offset: tuple[float, float] = (1.0, 0.0)
     """(scale, offset): value = scale * number in the file + offset."""
     colour: ColorInterp | None = None
@@ -128,7 +128,8 @@ def _describe(dataset: Any, layers: Sequence[LayerDescription], tags: Mapping[st
     for index, layer in enumerate(layers, start=1):
         dataset.set_band_description(index, layer.name)
         dataset.update_tags(index, **layer.tags)
-        dataset.update_tags(index, ns="IMAGERY", **layer.imagery)
+        imagery = {um: f"{float(layer.tags[nm]) / 1000:g}" for nm, um in _IMAGERY.items() if nm in layer.tags}
+        dataset.update_tags(index, ns="IMAGERY", **imagery)
 
 
 def write_on_grid(

@@ -165,7 +165,6 @@ def sharpened(
     weight_of, result = dict(zip(in_range, weights.tolist(), strict=True)), []
     for k, band in enumerate(bands):
         text = f"weighted Brovey by {source}, weight {weight_of[k]:.4g}" if k in weight_of else "no"
-        tags, imagery = file.tags(k + 1) | {"PANSHARPENED": text}, file.tags(k + 1, ns="IMAGERY")
-        values = file.scales[k], file.offsets[k]
-        result.append(LayerDescription(band.name, file.units[k] or "", tags, imagery, values))
+        tags, values = file.tags(k + 1) | {"PANSHARPENED": text}, (file.scales[k], file.offsets[k])
+        result.append(LayerDescription(band.name, file.units[k] or "", tags, values))
     return result, blocks()
