@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, TypeVar
 
-from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUndefined, Template, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup
 
 from agalign._version import __version__
@@ -203,7 +203,7 @@ def _page(**values: Any) -> str:
 
 
 def _template() -> Template:
-    """The template of the page; its bytecode is kept in the user's folder of temporary files, if there is one."""
+    """The template of the page."""
     environment = Environment(
         loader=PackageLoader(__package__, "."),
         autoescape=select_autoescape(["j2"]),
@@ -214,10 +214,6 @@ def _template() -> Template:
         finalize=lambda value: value if isinstance(value, Markup) else printable(value),
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
-    with suppress(OSError, RuntimeError):  # without a temporary folder, and if it is full
-        environment.bytecode_cache = FileSystemBytecodeCache()
-        return environment.get_template("page.html.j2")
-    environment.bytecode_cache = None
     return environment.get_template("page.html.j2")
 
 
