@@ -20,7 +20,7 @@ from agalign.host.text import escape_controls
 from agalign.rasters.preview import ERROR_FULL_PX
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, RunFacts
 from agalign.records.panels_and_sky import PanelPart, SkyPart
-from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
+from agalign.records.sidecar import BandResult, ErrorPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
 from agalign.report.pair_totals import CautionGroup, PairTotals, usable_bands
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
@@ -74,7 +74,7 @@ class FlightFacts:
         """Labels of the captures of the run that have no sidecar."""
         self._summary = CsvTable(SUMMARY_COLUMNS)
         self._rows = DataParts(out, "rows", _ROWS_PER_PART)
-        self._details = DataParts(out, "details", _DETAILS_PER_PART)
+        self._details = DataParts(out, "details", _DETAILS_PER_PART, self._take_lattices)
         self._masked: dict[str, list[float]] = defaultdict(list)
         self._lattices: dict[bytes, int] = {}
         """Centres of windows, which many pairs share, and their index, of the current part of the details."""
@@ -109,10 +109,8 @@ class FlightFacts:
             if status == "missing":
                 self._summary.add(keys | {"band": name, "status": status, "reason": reason, "check": reason})
         self._count(facts, sidecar.camera.unit)
-        if self._rows.add(_map_row(facts)):
-            self._rows.flush()
-        if self._details.add(facts):
-            self._flush_details()
+        self._rows.add(_map_row(facts))
+        self._details.add(facts)
 
     def _count(self, facts: dict[str, Any], unit: str) -> None:
         label, camera = facts["label"], self._units.setdefault((facts["camera"], unit), CameraOffsets())
@@ -141,11 +139,12 @@ class FlightFacts:
             "picture": quote(file.with_suffix(".png").as_posix()),
         }
 
-    def _flush_details(self) -> None:
-        lattices = [np.frombuffer(centres).tolist() for centres in self._lattices]
-        self._details.flush({"first_lattice": self._first_lattice, "lattices": lattices})
+    def _take_lattices(self) -> dict[str, Any]:
+        """Return the lattices of the current part of the details, and begin with those of the next."""
+        first, lattices = self._first_lattice, [np.frombuffer(centres).tolist() for centres in self._lattices]
         self._first_lattice += len(lattices)
         self._lattices = {}
+        return {"first_lattice": first, "lattices": lattices}
 
     def add_excluded(self, part: PanelPart | SkyPart) -> None:
         """Add the bands of a capture that is not aligned, as it shows a panel or the sky."""
@@ -167,7 +166,7 @@ class FlightFacts:
     def write(self) -> None:
         """Write OUT/summary.csv, and the last parts of the data of the page. Raises OutputError."""
         self._rows.flush()
-        self._flush_details()
+        self._details.flush()
         self._summary.write(self.out / SUMMARY_FILE)
 
     @property
@@ -221,10 +220,7 @@ class FlightFacts:
         offset_px, offset_length_px = _band_offset(band.grid, sidecar)
         if offset_length_px is not None and band.status != "reference":
             self.pairs.bands[band.band].offsets_px.append(offset_length_px)
-        is_measured = np.isfinite(shifts_px)
-        known_px = np.where(is_measured, shifts_px, 0.0)
-        steps = np.rint(known_px / _SHIFT_STEP_PX).astype(int).ravel().tolist()
-        shifts = zip(steps, is_measured.ravel().tolist(), strict=True)
+        steps = (shifts_px / _SHIFT_STEP_PX).ravel().tolist()
         return {name: row[name] for name in SHOWN_COLUMNS} | {
             "seconds": round(band.seconds, 2),
             "written": band.place is not None,
@@ -236,11 +232,11 @@ class FlightFacts:
             "coverage": row["residual_coverage"],
             "similarity": None if metrics is None else similarity,
             "prediction": _prediction(band.prediction),
-            "geometry": _geometry(band.geometry),
+            "geometry": None if band.geometry is None else band.geometry.model_dump(mode="json"),
             "occluded": value_at(band, "relief.occluded"),
             "check": [text for text in checks if text != band.reason],
             "lattice": self._first_lattice + self._lattices.setdefault(lattice, len(self._lattices)),
-            "shifts": [step if known else None for step, known in shifts],
+            "shifts": [round(step) if math.isfinite(step) else None for step in steps],
         }
 
 
@@ -315,13 +311,6 @@ def _prediction(prediction: Prediction | None) -> dict[str, Any] | None:
         return None
     std_px, off_px = rounded(prediction.std_px), rounded(prediction.off_px)
     return {"from": prediction.source, "std_px": std_px, "off_px": off_px}
-
-
-def _geometry(geometry: GeometryPart | None) -> dict[str, Any] | None:
-    if geometry is None:
-        return None
-    held_out_px = {kind: rounded(px) for kind, px in geometry.held_out_p95_px.items()}
-    return {"kind": geometry.kind, "held_out_p95_px": held_out_px}
 
 
 def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:

@@ -5,7 +5,7 @@ OUT/report-data, which the page loads when they are needed. A page that is opene
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +28,8 @@ class DataParts:
     kind: str
     """`rows` or `details`; the function of the page with this name and `add` before it takes a part."""
     size: int
+    also: Callable[[], Mapping[str, Any]] = dict
+    """Returns further data of the current part, when it ends."""
     files: list[str] = field(default_factory=list)
     """Names of the scripts, relative to the output folder, of all parts but the first."""
     first: dict[str, Any] | None = None
@@ -35,25 +37,24 @@ class DataParts:
     _records: list[dict[str, Any]] = field(default_factory=list)
     _count: int = 0
 
-    def add(self, record: dict[str, Any]) -> bool:
-        """Add a record; return True if the part is full, and `flush` must follow."""
+    def add(self, record: dict[str, Any]) -> None:
+        """Add a record, and end the part if it is full. Raises OutputError."""
         self._records.append(record)
         self._count += 1
-        return len(self._records) == self.size
+        if len(self._records) == self.size:
+            self.flush()
 
-    def flush(self, also: Mapping[str, Any] | None = None) -> None:
-        """End the current part, with further data of it, and control characters escaped. Raises OutputError."""
+    def flush(self) -> None:
+        """End the current part, with control characters escaped. Raises OutputError."""
         if not self._records and self.first is not None:
             return
-        part = {"from": self._count - len(self._records), "records": self._records, **(also or {})}
+        start = self._count - len(self._records)
+        part = {"from": start, "records": printable(self._records), **self.also()}
         self._records = []
-        text = _in_json(part)
-        if "\\" in text or not text.isprintable():  # few parts, so that most texts are searched at once
-            part["records"] = printable(part["records"])
-            text = _in_json(part)
         if self.first is None:
             self.first = part
             return
+        text = json.dumps(part, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
         # The name contains a checksum: the earlier page, and its data, stand until the new page replaces it.
         digest = hashlib.sha256(text.encode()).hexdigest()[:16]
         file = f"{DATA_FOLDER}/{self.kind}-{len(self.files) + 2}-{digest}.js"
@@ -68,10 +69,6 @@ class DataParts:
         for file in self.files:
             text = (self.out / file).read_text("utf-8")
             yield json.loads(text[text.index("(") + 1 : text.rindex(")")])
-
-
-def _in_json(part: Mapping[str, Any]) -> str:
-    return json.dumps(part, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def printable(value: Any) -> Any:
