@@ -24,10 +24,9 @@ def index_before(context: ProductContext, index: Index, span: tuple[float, float
     index is missing, and UnreadableFileError.
     """
     grid, (width, height) = context.grid, context.capture.reference.size_px
-    layers = [layer for layer in context.layers if not layer.is_gap]
-    chosen = [
-        layers[i] for i in bands_for(index, [la.band.name for la in layers], [la.band.wavelength_nm for la in layers])
-    ]
+    layers = {layer.band.name: layer for layer in context.layers if not layer.is_gap}
+    names = bands_for(index, {name: layer.band.wavelength_nm for name, layer in layers.items()})
+    chosen = [layers[name] for name in names]
     is_inside = 0 <= grid.x0 <= width - grid.width and 0 <= grid.y0 <= height - grid.height
     has_same_pixels = grid.scale == SAME_PIXELS and not grid.undistorted and is_inside
     has_same_pixels &= all(la.band.size_px == (width, height) for la in chosen)

@@ -255,24 +255,23 @@ def _checked(index: Index) -> Index:
     return replace(index, any_unit=bool(any_unit))
 
 
-def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float | None]) -> list[int]:
-    """Return the positions of the bands of an index, in the order of `index.symbols`, among bands with these names.
+def bands_for(index: Index, wavelengths_nm: Mapping[str, float | None]) -> list[str]:
+    """Return the names of the bands of an index, in the order of `index.symbols`, given the wavelengths of bands.
 
     If several bands have a role, that nearest to the nominal wavelength is used. Raises InputError, which names the
     missing role.
     """
-    roles = [role_of(name, wavelength_nm) for name, wavelength_nm in zip(names, wavelengths_nm, strict=True)]
     result = []
     for role in index.roles:
-        candidates = [i for i, own_role in enumerate(roles) if own_role == role]
-        if not candidates:
-            raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
         # Bands with a known wavelength first; of two with the same wavelength that with the name of the role.
-        distances = [
-            (math.inf if w is None else abs(w - ROLES[role].nominal_nm), role_of(name, None) != role)
-            for name, w in zip(names, wavelengths_nm, strict=True)
-        ]
-        result.append(min(candidates, key=distances.__getitem__))
+        distances = {
+            name: (math.inf if nm is None else abs(nm - ROLES[role].nominal_nm), role_of(name, None) != role)
+            for name, nm in wavelengths_nm.items()
+            if role_of(name, nm) == role
+        }
+        if not distances:
+            raise InputError(f"{index.name} needs a {role} band; there are {', '.join(wavelengths_nm)}")
+        result.append(min(distances, key=distances.__getitem__))
     return result
 
 

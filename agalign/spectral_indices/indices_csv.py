@@ -37,8 +37,7 @@ def to_check(index: Index | None, unit: str, sidecar: Sidecar, run: RunFacts, la
     elif unit.endswith("radiance"):
         result.append(f"the light in each band is a part of its value, as the bands are {unit}, not reflectance")
     with suppress(InputError):  # other bands than those of the sidecar
-        names = [b.band for b in sidecar.bands]
-        used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}
+        used = bands_for(index, {b.band: b.wavelength_nm for b in sidecar.bands})
         result += [f"{c.band}: {c.reason}" for c in run.cautions(sidecar, label) if c.band in used]
     return "; ".join(result)
 
@@ -59,28 +58,21 @@ def reports_of(sidecar: Sidecar, label: str, out: Path, run: RunFacts) -> list[I
     return result
 
 
-def read_table(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv that can be read; none if the file does not exist."""
-    rows: list[IndexReport] = []
-    with suppress(OSError, csv.Error):
-        for line in csv.DictReader(io.StringIO(read_regular(out / INDICES_FILE).decode(errors="replace"))):
-            with suppress(ValueError, KeyError, TypeError, AttributeError):  # too few or too many cells
-                rows.append(_report_of_row(line, out))
-    return rows
-
-
 def refuse_foreign_table(folder: Path) -> None:
     """Raise ConfigurationError if a folder has a file with the name of the table that no command has written."""
     refuse_foreign(folder / INDICES_FILE, (PAGE_STARTS[INDICES_FILE],), "choose another folder with -o")
 
 
 def current_rows(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv that are still true: they have a raster that exists and was not written again
-    since, or are of an index that could not be calculated; and they are not of a renamed capture.
+    """Return the rows of OUT/indices.csv that can be read and are of a raster that exists, whose tags have the
+    statistics, or of an index that could not be calculated; those of renamed captures are left out.
     """
-    renamed = renamed_captures(out)
-    rows = [row for row in read_table(out) if row.capture not in renamed]
-    return [current for row in rows if (current := _current(row)) is not None]
+    rows, renamed = list[IndexReport](), renamed_captures(out)
+    with suppress(OSError, csv.Error):
+        for line in csv.DictReader(io.StringIO(read_regular(out / INDICES_FILE).decode(errors="replace"))):
+            with suppress(ValueError, KeyError, TypeError, AttributeError):  # too few or too many cells
+                rows.append(_report_of_row(line, out))
+    return [row for row in rows if row.capture not in renamed]
 
 
 def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:
@@ -96,21 +88,10 @@ def update_table(
     Return all rows. Without any, only an earlier table is written again, empty. Raises OutputError.
     """
     result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
-    if result or read_table(out):
+    if result or (out / INDICES_FILE).is_file():
         cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
         write_csv(out / INDICES_FILE, (*_OF_CAPTURE, *_OF_INDEX), cells)
     return result
-
-
-def _current(row: IndexReport) -> IndexReport | None:
-    """Return a row if its raster has the statistics of the row, or if it has a problem instead; else None."""
-    if row.path is None:
-        return row if row.problem else None
-    raster = IndexRaster.read(row.path)
-    if raster is None or raster.statistics.unit != row.statistics.unit:
-        return None
-    is_same = f"{raster.statistics.median:g}" == f"{row.statistics.median:g}"
-    return replace(row, is_masked=raster.is_masked) if is_same else None
 
 
 def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
@@ -138,23 +119,24 @@ def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
 
 
 def _report_of_row(cells: Mapping[str, str], out: Path) -> IndexReport:
-    """Return the report of which `_cells` wrote a row. Raises ValueError or KeyError."""
+    """Return the report of which `_cells` wrote a row. Raises ValueError or KeyError, also if its raster is missing."""
     cells = {k: _unquoted(v) for k, v in cells.items()}
-    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
-    numbers["masked_share"] = float(cells["masked_share"] or 0)
-    path = out / cells["file"]
-    path.relative_to(out)  # raises ValueError for an absolute path, which no table has
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
-    return IndexReport(
+    report = IndexReport(
         Path(cells["folder"], cells["capture"]).as_posix(),
-        path=path if cells["file"] else None,
-        statistics=IndexStatistics(unit=cells["input"], **numbers),
-        index=cells["index"],
+        cells["index"],
         problem=cells["problem"],
         captured_at=cells["captured_at"],
         latitude=latitude,
         longitude=longitude,
     )
+    path = out / cells["file"]
+    path.relative_to(out)  # raises ValueError for an absolute path, which no table has
+    if (raster := IndexRaster.read(path)) is not None:
+        return replace(report, path=path, statistics=raster.statistics, is_masked=raster.is_masked)
+    if cells["file"] or not report.problem:
+        raise ValueError("its raster is missing")
+    return report
 
 
 def _unquoted(text: str) -> str:

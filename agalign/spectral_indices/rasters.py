@@ -385,7 +385,8 @@ def index_rasters(base: Path) -> list[IndexRaster]:
 
 def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
     """Return the bands of an index. Raises InputError if one is missing or not usable."""
-    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
+    by_name = {band.name: band for band in bands}
+    chosen = [by_name[name] for name in bands_for(index, {b.name: b.wavelength_nm for b in bands})]
     for band in chosen:
         if band.problem:
             raise InputError(band.problem)

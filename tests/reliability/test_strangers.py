@@ -28,7 +28,7 @@ from agalign.host.text import without_controls
 from agalign.records.panels_and_sky import read_panels, read_sky
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar_file import find_sidecars
-from agalign.spectral_indices.indices_csv import read_table
+from agalign.spectral_indices.indices_csv import current_rows
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 
@@ -55,7 +55,7 @@ def test_a_record_that_is_not_a_regular_file_is_an_error(
 
 def test_a_table_that_is_not_a_regular_file_is_empty(tmp_path: Path, irregular: Callable[[Path], None]) -> None:
     irregular(tmp_path / INDICES_FILE)
-    assert read_table(tmp_path) == []
+    assert current_rows(tmp_path) == []
 
 
 @pytest.mark.parametrize(

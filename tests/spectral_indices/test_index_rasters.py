@@ -37,8 +37,8 @@ from agalign.spectral_indices.formulas import (
     index_named,
     index_of_formula,
 )
-from agalign.spectral_indices.indices_csv import read_table, update_table
-from agalign.spectral_indices.rasters import IndexReport, IndexStatistics
+from agalign.spectral_indices.indices_csv import current_rows, update_table
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
@@ -269,17 +269,16 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     assert float(rows[1]["p5"]) < float(rows[1]["median"]) < float(rows[1]["p95"])
     assert not list((tmp_path / "out").rglob("*ndvi*"))
     (target / rows[0]["file"]).unlink()
-    assert len(update_table(target, [])) == len(read_table(target)) == 3
+    assert len(update_table(target, [])) == len(current_rows(target)) == 3
 
 
 @pytest.mark.parametrize("line", [b",,", b"," * 40 + b"x", b"a\0b", b"1,2,3", b"\xe9", b"x" * 200_000 + b",y"])
 def test_a_damaged_line_costs_only_its_own_row(tmp_path: Path, line: bytes) -> None:
-    statistics = IndexStatistics(masked_share=0.25)
-    update_table(tmp_path, [IndexReport("IMG_0001", "ndvi", None, statistics, "left out")])
+    update_table(tmp_path, [IndexReport("IMG_0001", "ndvi", problem="left out")])
     path = tmp_path / "indices.csv"
     undamaged = path.read_bytes()
     path.write_bytes(undamaged + line + b"\n")
-    assert [row.statistics.masked_share for row in read_table(tmp_path)] == [0.25]
+    assert [row.problem for row in current_rows(tmp_path)] == ["left out"]
     update_table(tmp_path, [])
     assert path.read_bytes() == undamaged
 
@@ -447,14 +446,14 @@ NM = (444.0, 475.0, 560.0, 650.0, 668.0, 705.0, 717.0, 842.0)
 def test_bands_are_those_nearest_to_the_nominal_wavelength_or_with_the_name(
     index: str, names: tuple[str, ...], wavelengths_nm: tuple[float | None, ...], expected: str
 ) -> None:
-    assert ", ".join(names[i] for i in bands_for(INDICES[index], names, wavelengths_nm)) == expected
+    assert ", ".join(bands_for(INDICES[index], dict(zip(names, wavelengths_nm, strict=True)))) == expected
 
 
 def test_a_missing_band_is_named() -> None:
     with pytest.raises(InputError, match="ndre needs a red edge band; there are Red, NIR"):
-        bands_for(INDICES["ndre"], ("Red", "NIR"), (668.0, 840.0))
+        bands_for(INDICES["ndre"], {"Red": 668.0, "NIR": 840.0})
     with pytest.raises(InputError, match="needs a red band"):
-        bands_for(INDICES["ndvi"], ("Blue", "Panchro", "NIR"), (475.0, 634.5, 842.0))
+        bands_for(INDICES["ndvi"], {"Blue": 475.0, "Panchro": 634.5, "NIR": 842.0})
     assert index_named(" NDVI ").name == "ndvi"
 
 
