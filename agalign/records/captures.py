@@ -84,8 +84,7 @@ class RunCapture:
     path: Path
     """Path of the sidecar."""
     result: Sidecar
-    """The sidecar without its long tables: all of them, of a long flight, would not fit in memory."""
-
+    """Content of the sidecar."""
     file_states: str = ""
     """States of its files in the run record."""
 
@@ -103,6 +102,7 @@ class RunCapture:
 def captures_of_run(out: Path) -> tuple[list[RunCapture], LeftOut]:
     """Return the captures of a run in the order of their labels, and those with an unreadable sidecar.
 
+    The sidecars lack their long tables: those of a long flight would not fit into memory.
     Raises InputError if `out` has no sidecars.
     """
     captures, left_out = [], []

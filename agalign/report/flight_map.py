@@ -28,16 +28,14 @@ class FlightMap:
     def __init__(self) -> None:
         self._features: dict[str, dict[str, Any]] = {}
 
-    def add(self, folder: str, sidecar: Sidecar) -> None:
-        """Add a capture, given its folder relative to the output folder.
+    def add(self, label: str, sidecar: Sidecar) -> None:
+        """Add a capture, given its label.
 
         The geometry is the footprint of the aligned rasters, or of the reference if there are none. Without a footprint
         it is the position of the camera, and null if that is unknown.
         """
-        path = Path(folder)
-        label = (path / sidecar.capture).as_posix()
         bands = [b for b in sidecar.bands if b.status != "reference"]
-        files = [(part.kind, (path / part.file).as_posix()) for part in sidecar.products]
+        files = {part.kind: (Path(label).parent / part.file).as_posix() for part in sidecar.products}
         facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
         self._features[label] = _feature(
             label,
@@ -54,8 +52,8 @@ class FlightMap:
                 "residual_p95_px": rounded(sidecar.largest_residual("residual_p95_px")),
                 # Files are relative to the output folder.
                 "sidecar": f"{label}.json",
-                "stack": dict(files).get("stack"),
-                "picture": dict(files).get("picture"),
+                "stack": files.get("stack"),
+                "picture": files.get("picture"),
                 "indices": [],
             },
         )

@@ -21,8 +21,8 @@ from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
 from agalign.host.own_files import refuse_foreign_pages
 from agalign.host.text import counted, escape_controls
+from agalign.records.captures import RunCapture
 from agalign.records.cautions import RunFacts
-from agalign.records.listed_files import ListedFiles
 from agalign.records.panels_and_sky import PanelPart, SkyPart, exclusions, read_panels, read_sky
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
@@ -110,21 +110,20 @@ def _captures(
         rows_of[row.capture].append(row)
     indices: list[IndexReport] = []
     changed: set[Path] = set()
-    for path, sidecar, states in _results(out, on_problem):
-        label = label_of(path, out)
-        listed = ListedFiles.of(sidecar, path.parent, states)
+    for capture in _results(out, on_problem):
+        label, listed = capture.label, capture.listed
         # The report needs no stacks: these may be deleted.
         problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}
         for problem in problems.values():
             on_problem(problem)
         changed |= problems.keys()
-        sidecar = _without(sidecar, path.parent, problems)
+        sidecar = _without(capture.result, capture.path.parent, problems)
         of_capture = reports_of(sidecar, label, out, facts.pairs.run) if table is None else []
         indices += of_capture
         rows = merged([row for row in rows_of.get(label, []) if row.path not in changed], of_capture)
         shown |= {row.path for row in rows if row.path is not None}
         facts.add(label, sidecar, rows)
-        flight_map.add(Path(label).parent.as_posix(), sidecar)
+        flight_map.add(label, sidecar)
     if table is not None:
         return facts, flight_map, [*table]
     written = update_table(out, indices, [row for row in earlier if row.path not in changed])
@@ -133,9 +132,9 @@ def _captures(
     return facts, flight_map, written
 
 
-def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[tuple[Path, Sidecar, str]]:
-    """Yield the results that the pages show: path and content of each sidecar, and the states of its files in the run
-    record. Those that cannot be read, or are at the place of another capture, are reported to `on_problem`.
+def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[RunCapture]:
+    """Yield the captures that the pages show, with their complete sidecars. Sidecars that cannot be read, or are at the
+    place of another capture, are reported to `on_problem`.
 
     Edited ones count: their checksums take three times as long as reading them, and `agalign verify` finds them.
     """
@@ -148,14 +147,14 @@ def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[tuple[P
         if problem := place_problem(path, sidecar):
             on_problem(f"{path}: {problem}")
         else:
-            yield path, sidecar, states
+            yield RunCapture(label_of(path, out), path, sidecar, states)
 
 
 def pair_totals(out: Path) -> PairTotals:
     """Return the band pairs in the pages of an output folder, without writing these."""
     pairs = PairTotals(RunFacts.of(out))
-    for path, sidecar, _ in _results(out, lambda _: None):
-        pairs.add(escape_controls(label_of(path, out)), sidecar)
+    for capture in _results(out, lambda _: None):
+        pairs.add(escape_controls(capture.label), capture.result)
     return pairs
 
 

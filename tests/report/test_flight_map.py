@@ -57,7 +57,7 @@ def sidecar_of(known: Capture, status: str = "ok") -> Sidecar:
 def mapped(out: Path, known: Capture, status: str = "ok") -> list[dict[str, Any]]:
     """The features of one capture."""
     on_map = FlightMap()
-    on_map.add("one", sidecar_of(known, status))
+    on_map.add(known.label, sidecar_of(known, status))
     on_map.write(out)
     return features_of(out)
 
@@ -162,7 +162,7 @@ def test_captures_of_an_earlier_run_stay_as_long_as_their_sidecars(tmp_path: Pat
 
 def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_path: Path) -> None:
     on_map = FlightMap()
-    on_map.add("one", sidecar_of(replace(capture(None), position=None)))
+    on_map.add("one/a", sidecar_of(replace(capture(None), position=None)))
     assert mapped(tmp_path, capture(None)), "the map of an earlier run"
     on_map.write(tmp_path)
     assert not list(tmp_path.iterdir())
