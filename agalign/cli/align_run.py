@@ -247,7 +247,7 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
         seconds=seconds,
     )
     if terminal.verbose or terminal.log_json:
-        for band in (b for b in result.bands if b.status != "reference"):
+        for band in result.moving:
             _print_pair(report.label, band, terminal)
 
 

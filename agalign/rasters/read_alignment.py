@@ -55,7 +55,7 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     """
     path = Path(sidecar)
     content = read_sidecar(path)
-    moving = [b.band for b in content.bands if b.status != "reference"]
+    moving = [b.band for b in content.moving]
     if band not in moving:
         raise no_such_band(path, band, moving, kind="moving band")
     if content.parallax is None and any(b.relief is not None for b in content.bands if b.band == band):

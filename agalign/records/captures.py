@@ -68,8 +68,7 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
 
 def _why_without_pixels(sidecar: Sidecar) -> str:
     """Return that a capture has no aligned pixels and why; empty if it has, or should have, some."""
-    moving = (band for band in sidecar.bands if band.status != "reference")
-    if sidecar.output is not None or any(band.is_usable(sidecar.accept_predicted_px) for band in moving):
+    if sidecar.output is not None or sidecar.usable:
         return ""
     known = (f": {name} is {status.replace('_', ' ')} ({reason})" for name, status, reason in sidecar.pairs if reason)
     return f"its capture has no aligned pixels{next(known, '')}"

@@ -123,7 +123,7 @@ class RunFacts:
         of_capture = [remedies.NOT_IN_INPUT] if label in self.not_in_input else []
         if sidecar.model and self.models and sidecar.model not in self.models:
             of_capture.append(remedies.OLD_MODEL)
-        for band in (b for b in sidecar.bands if b.status != "reference"):
+        for band in sidecar.moving:
             yield from (Caution(band.band, remedy, remedy.cause, 0.0) for remedy in of_capture)
 
     def _of_light(self, sidecar: Sidecar) -> Iterator[Caution]:

@@ -65,7 +65,6 @@ from agalign.values.remedies import MISSING_BAND
 from agalign.values.residual import Residual, Similarity
 
 SCHEMA = "agalign/3"
-PointPx = tuple[Number, Number]
 SampledPx = Annotated[NDArray[np.float64], Array((None, 2), 3)]
 """Their rounding is small compared with the error of interpolation between them."""
 Slopes = Annotated[NDArray[np.float64], Array((None, 2), 5)]
@@ -185,7 +184,7 @@ class ReliefPart(_Part):
 
     file: RelativeFile | None
     """[Parallax](outputs.md#parallax) on the grid of the stack."""
-    baseline: PointPx
+    baseline: tuple[Number, Number]
     """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
     occluded: Number4
     """Share of occluded pixels."""
@@ -377,13 +376,14 @@ class BandResult(_Part):
     def alignment(self, size_px: Size, mapping: PixelMapping) -> Alignment:
         """Return the alignment of a moving band, given (width, height) of the reference and the mapping of the band."""
         assert self.seed is not None
-        residual = None if self.metrics is None else self.metrics.windows
+        metrics = self.metrics or MetricsPart(before=Similarity(), after=Similarity())
+        residual = metrics.windows
         return Alignment(
             mapping,
             size_px,
             residual=residual,
-            before=Similarity() if self.metrics is None else self.metrics.before,
-            after=Similarity() if self.metrics is None else self.metrics.after,
+            before=metrics.before,
+            after=metrics.after,
             held_out_p95_px={} if self.geometry is None else self.geometry.held_out_p95_px,
             is_seed_usable=self.status == "seed_only",
             error=None if self.error is None else self.error.mapping_error(size_px, residual, mapping.parallax),
@@ -665,9 +665,19 @@ class Sidecar(_Part):
         return bands
 
     @property
+    def moving(self) -> list[BandResult]:
+        """All bands but the reference."""
+        return [band for band in self.bands if band.status != "reference"]
+
+    @property
+    def usable(self) -> list[BandResult]:
+        """The moving bands that indices can use."""
+        return [band for band in self.moving if band.is_usable(self.accept_predicted_px)]
+
+    @property
     def pairs(self) -> list[tuple[str, str, str | None]]:
         """(band, status, reason) of every band that is to be aligned; missing bands have the status `missing`."""
-        moving = [(b.band, str(b.status), b.reason) for b in self.bands if b.status != "reference"]
+        moving = [(b.band, str(b.status), b.reason) for b in self.moving]
         unreadable = self.unreadable_bands
         return [*moving, *((name, "missing", unreadable.get(name, MISSING_BAND.cause)) for name in self.missing_bands)]
 

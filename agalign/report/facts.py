@@ -22,7 +22,7 @@ from agalign.records.cautions import MIN_SHARE_OVER_1_PX, RunFacts
 from agalign.records.panels_and_sky import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
-from agalign.report.pair_totals import CautionGroup, PairTotals, usable_bands
+from agalign.report.pair_totals import CautionGroup, PairTotals
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
 from agalign.spectral_indices.formulas import index_named
 from agalign.spectral_indices.rasters import PICTURE_PX, IndexReport, reason_not_written
@@ -333,7 +333,7 @@ def largest_error(sidecar: Sidecar) -> ErrorPart | None:
     """Return the largest expected error of the moving bands of a capture that indices can use, by px of the reference;
     None if none is known.
     """
-    errors = (b.error for b in usable_bands(sidecar) if b.error is not None)
+    errors = (b.error for b in sidecar.usable if b.error is not None)
     return max(errors, key=attrgetter("std_px"), default=None)
 
 

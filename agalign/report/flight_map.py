@@ -34,7 +34,6 @@ class FlightMap:
         The geometry is the footprint of the aligned rasters, or of the reference if there are none. Without a footprint
         it is the position of the camera, and null if that is unknown.
         """
-        bands = [b for b in sidecar.bands if b.status != "reference"]
         files = {part.kind: (Path(label).parent / part.file).as_posix() for part in sidecar.products}
         facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
         self._features[label] = _feature(
@@ -44,9 +43,9 @@ class FlightMap:
                 "status": sidecar.status,
                 **facts,
                 "accuracy_m": sidecar.footprint_accuracy_m,
-                "bands": len(bands),
-                "bands_aligned": sum(b.status == "aligned" for b in bands),
-                "bands_predicted": sum(b.status == "predicted" for b in bands),
+                "bands": len(sidecar.moving),
+                "bands_aligned": sum(b.status == "aligned" for b in sidecar.bands),
+                "bands_predicted": sum(b.status == "predicted" for b in sidecar.bands),
                 # Of the worst aligned band, px of the reference.
                 "residual_px": rounded(sidecar.largest_residual("residual_px")),
                 "residual_p95_px": rounded(sidecar.largest_residual("residual_p95_px")),

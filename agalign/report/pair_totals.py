@@ -13,15 +13,9 @@ from typing import NamedTuple
 
 from agalign.host.text import counted
 from agalign.records.cautions import Caution, RunFacts
-from agalign.records.sidecar import BandResult, Sidecar
+from agalign.records.sidecar import Sidecar
 from agalign.report.light_over_captures import LightOverCaptures
 from agalign.values.remedies import NO_RESULT, OTHER_REFERENCE, Remedy
-
-
-def usable_bands(sidecar: Sidecar) -> list[BandResult]:
-    """Return the moving bands of a capture that indices can use."""
-    limit_px = sidecar.accept_predicted_px
-    return [b for b in sidecar.bands if b.status != "reference" and b.is_usable(limit_px)]
 
 
 class ExpectedError(NamedTuple):
@@ -128,7 +122,7 @@ class PairTotals:
             band.seconds += [] if part is None else [part.seconds]
             if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
                 band.residuals_px.append(part.metrics.after.residual_px)
-        for part in usable_bands(result):
+        for part in result.usable:
             self.usable[str(part.status)] += 1
             if part.error is not None:
                 error = part.error.std_px, part.error.other_px, label, part.band, part.share_over_1_px

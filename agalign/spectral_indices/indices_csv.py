@@ -49,12 +49,10 @@ def reports_of(sidecar: Sidecar, label: str, out: Path, run: RunFacts) -> list[I
     result = []
     for part in sidecar.products:
         path = (out / label).parent / part.file
-        if part.kind == "index" and path.suffix == ".tif":
-            name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
-            if (raster := IndexRaster.read(path)) is not None:
-                problem = to_check(raster.index, raster.statistics.unit, sidecar, run, label)
-                report = IndexReport(label, name, path, raster.statistics, problem, is_masked=raster.is_masked)
-                result.append(report.of(sidecar))
+        if part.kind == "index" and path.suffix == ".tif" and (raster := IndexRaster.read(path)) is not None:
+            problem = to_check(raster.index, raster.statistics.unit, sidecar, run, label)
+            report = IndexReport(label, raster.name, path, raster.statistics, problem, is_masked=raster.is_masked)
+            result.append(report.of(sidecar))
     return result
 
 

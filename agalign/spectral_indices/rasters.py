@@ -195,20 +195,16 @@ class IndexRasters(Product):
                 is_masked = index.name in stay_masked if raster is None else raster.is_masked
                 report = write_index(reader, masked if is_masked else bands, index, base, label, samples=samples)
                 if report.path is not None:
-                    yield from self._files(context, index, report)
+                    before = index_before(context, index, (report.statistics.low, report.statistics.high))
+                    named = None if before is None else (index.name, before)
+                    yield WrittenFile(self.kind, report.path, index_before=named)
+                    yield WrittenFile(self.kind, report.path.with_suffix(".png"))
                 elif raster is not None:
                     yield LostFile(raster.path, report.problem)
                 elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
                     problems.append(f"{index.name}: {report.problem}")
         if problems:
             raise InputError("; ".join(problems))
-
-    def _files(self, context: ProductContext, index: Index, report: IndexReport) -> Iterator[WrittenFile]:
-        """Yield the raster of a report and its picture, with the index of the unaligned bands."""
-        assert report.path is not None
-        before = index_before(context, index, (report.statistics.low, report.statistics.high))
-        yield WrittenFile(self.kind, report.path, index_before=None if before is None else (index.name, before))
-        yield WrittenFile(self.kind, report.path.with_suffix(".png"))
 
 
 def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
