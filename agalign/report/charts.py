@@ -92,10 +92,10 @@ def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[dict[str, Any]]:
     """
     result = []
     for camera, known in cameras.items():
-        order = sorted(range(len(known.labels)), key=known.labels.__getitem__)
-        offsets = [known.offsets_px[i] for i in order]
+        captures = sorted(known.captures, key=lambda one: one[:2])
+        offsets = [offsets_px for _, _, offsets_px in captures]
         names = list(dict.fromkeys(name for of_capture in offsets for name in of_capture))
-        if len(order) < 3 or not names:
+        if len(captures) < 3 or not names:
             continue
         missing = (np.nan, np.nan)
         differences = [
@@ -106,13 +106,13 @@ def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[dict[str, Any]]:
         aligned = np.array([d if np.nansum(differences[0] * d) >= 0 else -d for d in differences])
         min_full_px = 0.2  # smaller drifts are noise
         full_px = float(np.nanmax(np.abs(aligned), initial=min_full_px))
-        step = max(1, math.ceil(len(order) / 400))  # more points than that are not distinguishable
+        step = max(1, math.ceil(len(captures) / 400))  # more points than that are not distinguishable
         hues = hues_of([known.reference, *names])  # as in the plan of the rig
         lines = [
             {"name": name, "hue": hues[name], "points": _polylines(of_band, full_px, step)}
             for name, of_band in zip(names, aligned, strict=True)
         ]
-        ends = known.labels[order[0]][1], known.labels[order[-1]][1]
+        ends = captures[0][1], captures[-1][1]
         result.append({"title": f"{camera} from capture to capture", "full_px": full_px, "lines": lines, "ends": ends})
     return result
 

@@ -44,10 +44,8 @@ _ROWS_PER_PART = 1000
 class CameraOffsets:
     """Offsets of the bands of a camera, for the chart over its captures."""
 
-    labels: list[tuple[str, str]] = field(default_factory=list)
-    """(time, label) of each capture."""
-    offsets_px: list[dict[str, tuple[float, float]]] = field(default_factory=list)
-    """(x, y) by aligned or predicted band, of each capture."""
+    captures: list[tuple[str, str, dict[str, tuple[float, float]]]] = field(default_factory=list)
+    """(time, label, offsets (x, y), px, by aligned or predicted band) of each capture."""
     reference: str = ""
     """The reference band of the last capture."""
 
@@ -118,9 +116,8 @@ class FlightFacts:
         self.seconds[label] = facts["seconds"]
         self.placed += facts["position"] is not None
         usable = [b for b in facts["bands"] if b["status"] in ("aligned", "predicted") and b["offset_px"]]
-        camera.labels.append((facts["captured_at"], label))
+        camera.captures.append((facts["captured_at"], label, {b["band"]: b["offset_px"] for b in usable}))
         camera.reference = facts["reference"]
-        camera.offsets_px.append({b["band"]: b["offset_px"] for b in usable})
 
     def _index(self, row: IndexReport) -> dict[str, Any]:
         assert row.path is not None

@@ -504,9 +504,9 @@ def test_the_rig_has_the_name_of_its_reference(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> None:
     offsets = [{"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)} for i in range(7)]
-    labels = [(f"2026-06-21T10:00:{i:02d}", f"{i:02d}") for i in range(7)]
+    captures = [(f"2026-06-21T10:00:{i:02d}", f"{i:02d}", one) for i, one in enumerate(offsets)]
     # In the order of time, whatever that of the captures is.
-    known = CameraOffsets(labels[::-1], offsets[::-1])
+    known = CameraOffsets(captures[::-1])
     (drift,) = drifts_of({"camera": known})
     assert drift["ends"] == ("00", "06")
     assert drift["full_px"] == pytest.approx(15, abs=0.01)
@@ -516,7 +516,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
     # Along the same baseline in the other direction, a band is drawn next to the first, not opposite to it.
     assert np.sign(np.diff(heights[0])).tolist() == np.sign(np.diff(heights[1][:3] + heights[1][4:])).tolist()
-    assert drifts_of({"camera": CameraOffsets(labels[:2], offsets[:2])}) == []
+    assert drifts_of({"camera": CameraOffsets(captures[:2])}) == []
 
 
 @pytest.mark.slow
