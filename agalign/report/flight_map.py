@@ -4,8 +4,7 @@ It is a view of the sidecars, and of the captures of panels and of the sky that 
 """
 
 import json
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +17,6 @@ from agalign.host.files import FLIGHT_MAP_FILE, write_text
 from agalign.records.panels_and_sky import PanelOrSkyPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.summary_csv import rounded
-from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import CameraIdentity, Pose, Position
 
 
@@ -28,8 +26,8 @@ class FlightMap:
     def __init__(self) -> None:
         self._features: dict[str, dict[str, Any]] = {}
 
-    def add(self, label: str, sidecar: Sidecar) -> None:
-        """Add a capture, given its label.
+    def add(self, label: str, sidecar: Sidecar, indices: Sequence[str] = ()) -> None:
+        """Add a capture, given its label and the rasters of its indices, relative to the output folder.
 
         The geometry is the footprint of the aligned rasters, or of the reference if there are none. Without a footprint
         it is the position of the camera, and null if that is unknown.
@@ -53,7 +51,7 @@ class FlightMap:
                 "sidecar": f"{label}.json",
                 "stack": files.get("stack"),
                 "picture": files.get("picture"),
-                "indices": [],
+                "indices": indices,
             },
         )
 
@@ -63,15 +61,6 @@ class FlightMap:
         shape = geojson_geometry(part.footprint, part.position)
         facts |= {"status": part.kind, "accuracy_m": part.footprint_accuracy_m, "indices": []}
         self._features[part.label] = _feature(part.label, shape, facts)
-
-    def add_indices(self, rows: Iterable[IndexReport], out: Path) -> None:
-        """Link the rasters of an index table, of files below `out`, of captures that were added before."""
-        rasters: dict[str, list[str]] = defaultdict(list)
-        for row in rows:
-            if row.path is not None and row.capture in self._features:
-                rasters[row.capture].append(row.path.relative_to(out).as_posix())
-        for label, files in rasters.items():
-            self._features[label]["properties"]["indices"] = files
 
     def write(self, out: Path) -> None:
         """Write the file atomically; remove that of an earlier run if no capture has a position. Raises OutputError."""

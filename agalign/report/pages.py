@@ -52,7 +52,7 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     """
     refuse_foreign_pages(out, "rename it")
     unreadable: list[str] = []
-    facts, flight_map, rows = _captures(out, unreadable.append)
+    facts, flight_map = _captures(out, unreadable.append)
 
     def readable(read: Callable[[Path], T]) -> T | None:
         try:
@@ -69,7 +69,6 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     unfinished = unfinished_run(run, excluded, facts.seconds)
     facts.add_without_result([] if unfinished is None else unfinished.missing)
     facts.write()
-    flight_map.add_indices(rows, out)
     flight_map.write(out)
     page = _page(
         flight=facts,
@@ -95,8 +94,8 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
 
 def _captures(
     out: Path, on_problem: Callable[[str], object], table: Sequence[IndexReport] | None = None
-) -> tuple[FlightFacts, FlightMap, list[IndexReport]]:
-    """Return the data of all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows too.
+) -> tuple[FlightFacts, FlightMap]:
+    """Return the data of all captures with a sidecar below OUT, and write OUT/indices.csv.
 
     All captures have to be read before it is known that the table leaves out rasters that are not masked like most:
     if it does, they are read again, with the rows of the `table`.
@@ -121,15 +120,15 @@ def _captures(
         of_capture = reports_of(sidecar, label, out, facts.pairs.run) if table is None else []
         indices += of_capture
         rows = merged([row for row in rows_of.get(label, []) if row.path not in changed], of_capture)
-        shown |= {row.path for row in rows if row.path is not None}
+        rasters = [row.path for row in rows if row.path is not None]
+        shown.update(rasters)
         facts.add(label, sidecar, rows)
-        flight_map.add(label, sidecar)
-    if table is not None:
-        return facts, flight_map, [*table]
-    written = update_table(out, indices, [row for row in earlier if row.path not in changed])
-    if shown - {row.path for row in written}:
-        return _captures(out, lambda _: None, written)
-    return facts, flight_map, written
+        flight_map.add(label, sidecar, [path.relative_to(out).as_posix() for path in rasters])
+    if table is None:
+        table = update_table(out, indices, [row for row in earlier if row.path not in changed])
+        if shown - {row.path for row in table}:
+            return _captures(out, lambda _: None, table)
+    return facts, flight_map
 
 
 def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[RunCapture]:
