@@ -101,31 +101,28 @@ def _captures(
     if it does, they are read again, with the rows of the `table`.
     """
     facts, flight_map, shown = FlightFacts(out), FlightMap(), set[Path]()
-    # An index that could not be calculated has no raster, whose removal would remove the row.
-    earlier = current_rows(out) if table is None else table
-    earlier = [row for row in earlier if row.path is not None or (out / f"{row.capture}.json").is_file()]
     rows_of: dict[str, list[IndexReport]] = defaultdict(list)
-    for row in earlier:
-        rows_of[row.capture].append(row)
-    indices: list[IndexReport] = []
-    changed: set[Path] = set()
+    for row in current_rows(out) if table is None else table:
+        # An index that could not be calculated has no raster, whose removal would remove the row.
+        if row.path is not None or (out / f"{row.capture}.json").is_file():
+            rows_of[row.capture].append(row)
     for capture in _results(out, on_problem):
         label, listed = capture.label, capture.listed
         # The report needs no stacks: these may be deleted.
         problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}
         for problem in problems.values():
             on_problem(problem)
-        changed |= problems.keys()
         sidecar = _without(capture.result, capture.path.parent, problems)
-        of_capture = reports_of(sidecar, label, out, facts.pairs.run) if table is None else []
-        indices += of_capture
-        rows = merged([row for row in rows_of.get(label, []) if row.path not in changed], of_capture)
+        rows = [row for row in rows_of[label] if row.path not in problems]
+        if table is None:
+            rows = merged(rows, reports_of(sidecar, label, out, facts.pairs.run))
+        rows_of[label] = rows
         rasters = [row.path for row in rows if row.path is not None]
         shown.update(rasters)
         facts.add(label, sidecar, rows)
         flight_map.add(label, sidecar, [path.relative_to(out).as_posix() for path in rasters])
     if table is None:
-        table = update_table(out, indices, [row for row in earlier if row.path not in changed])
+        table = update_table(out, [row for rows in rows_of.values() for row in rows], earlier=[])
         if shown - {row.path for row in table}:
             return _captures(out, lambda _: None, table)
     return facts, flight_map
