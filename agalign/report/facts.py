@@ -21,6 +21,7 @@ from agalign.rasters.preview import ERROR_FULL_PX
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, RunFacts
 from agalign.records.panels_and_sky import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GridPart, OutputPart, Sidecar
+from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import DataParts
 from agalign.report.pair_totals import CautionGroup, PairTotals
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
@@ -70,7 +71,7 @@ class FlightFacts:
         """Number of captures with a position."""
         self.without_result: Sequence[str] = ()
         """Labels of the captures of the run that have no sidecar."""
-        self._summary = CsvTable(SUMMARY_COLUMNS)
+        self._summary, self._map = CsvTable(SUMMARY_COLUMNS), FlightMap()
         self._rows = DataParts(out, "rows", _ROWS_PER_PART)
         self._details = DataParts(out, "details", _DETAILS_PER_PART, self._take_lattices)
         self._masked: dict[str, list[float]] = defaultdict(list)
@@ -107,6 +108,7 @@ class FlightFacts:
             if status == "missing":
                 self._summary.add(keys | {"band": name, "status": status, "reason": reason, "check": reason})
         self._count(facts, sidecar.camera.unit)
+        self._map.add(label, sidecar, [row.path.relative_to(self.out).as_posix() for row in indices if row.path])
         self._rows.add(_map_row(facts))
         self._details.add(facts)
 
@@ -148,6 +150,7 @@ class FlightFacts:
         row = {"folder": part.folder, "capture": part.capture, "status": part.kind, "reason": part.sentence}
         for band in part.bands:
             self._summary.add(row | {"band": band.band})
+        self._map.add_excluded(part)
 
     def add_without_result(self, labels: Sequence[str]) -> None:
         """Add the captures of the run that have no sidecar."""
@@ -161,10 +164,11 @@ class FlightFacts:
         return self.pairs.groups(self.without_result)
 
     def write(self) -> None:
-        """Write OUT/summary.csv, and the last parts of the data of the page. Raises OutputError."""
+        """Write OUT/summary.csv, OUT/flight.geojson and the last parts of the data of the page. Raises OutputError."""
         self._rows.flush()
         self._details.flush()
         self._summary.write(self.out / SUMMARY_FILE)
+        self._map.write(self.out)
 
     @property
     def files(self) -> list[str]:

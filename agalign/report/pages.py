@@ -29,7 +29,6 @@ from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import find_sidecars, label_of, place_problem, read_sidecar
 from agalign.report.charts import drifts_of, rig_views
 from agalign.report.facts import FlightFacts
-from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
 from agalign.report.pair_totals import PairTotals
 from agalign.report.terms import DOC_PAGES, TERMS
@@ -52,7 +51,7 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     """
     refuse_foreign_pages(out, "rename it")
     unreadable: list[str] = []
-    facts, flight_map = _captures(out, unreadable.append)
+    facts = _captures(out, unreadable.append)
 
     def readable(read: Callable[[Path], T]) -> T | None:
         try:
@@ -65,11 +64,9 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     excluded: list[PanelPart | SkyPart] = [*(one for one in panels if one.is_left_out), *sky]
     for one in excluded:
         facts.add_excluded(one)
-        flight_map.add_excluded(one)
     unfinished = unfinished_run(run, excluded, facts.seconds)
     facts.add_without_result([] if unfinished is None else unfinished.missing)
     facts.write()
-    flight_map.write(out)
     page = _page(
         flight=facts,
         facts=facts.in_page(),
@@ -94,13 +91,13 @@ def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
 
 def _captures(
     out: Path, on_problem: Callable[[str], object], table: Sequence[IndexReport] | None = None
-) -> tuple[FlightFacts, FlightMap]:
+) -> FlightFacts:
     """Return the data of all captures with a sidecar below OUT, and write OUT/indices.csv.
 
     All captures have to be read before it is known that the table leaves out rasters that are not masked like most:
     if it does, they are read again, with the rows of the `table`.
     """
-    facts, flight_map, shown = FlightFacts(out), FlightMap(), set[Path]()
+    facts, shown = FlightFacts(out), set[Path]()
     rows_of: dict[str, list[IndexReport]] = defaultdict(list)
     for row in current_rows(out) if table is None else table:
         # An index that could not be calculated has no raster, whose removal would remove the row.
@@ -117,15 +114,13 @@ def _captures(
         if table is None:
             rows = merged(rows, reports_of(sidecar, label, out, facts.pairs.run))
         rows_of[label] = rows
-        rasters = [row.path for row in rows if row.path is not None]
-        shown.update(rasters)
+        shown.update(row.path for row in rows if row.path is not None)
         facts.add(label, sidecar, rows)
-        flight_map.add(label, sidecar, [path.relative_to(out).as_posix() for path in rasters])
     if table is None:
         table = update_table(out, [row for rows in rows_of.values() for row in rows], earlier=[])
         if shown - {row.path for row in table}:
             return _captures(out, lambda _: None, table)
-    return facts, flight_map
+    return facts
 
 
 def _results(out: Path, on_problem: Callable[[str], object]) -> Iterator[RunCapture]:
