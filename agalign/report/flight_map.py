@@ -17,7 +17,7 @@ from agalign.host.files import FLIGHT_MAP_FILE, write_text
 from agalign.records.panels_and_sky import PanelOrSkyPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.summary_csv import rounded
-from agalign.values.capture import CameraIdentity, Pose, Position
+from agalign.values.capture import Position
 
 
 class FlightMap:
@@ -33,13 +33,12 @@ class FlightMap:
         it is the position of the camera, and null if that is unknown.
         """
         files = {part.kind: (Path(label).parent / part.file).as_posix() for part in sidecar.products}
-        facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
         self._features[label] = _feature(
             label,
-            geojson_geometry(sidecar.footprint, sidecar.position),
+            sidecar,
             {
                 "status": sidecar.status,
-                **facts,
+                **_place(sidecar),
                 "accuracy_m": sidecar.footprint_accuracy_m,
                 "bands": len(sidecar.moving),
                 "bands_aligned": sum(b.status == "aligned" for b in sidecar.bands),
@@ -57,10 +56,8 @@ class FlightMap:
 
     def add_excluded(self, part: PanelOrSkyPart) -> None:
         """Add a capture that is not aligned, as it shows a panel or the sky."""
-        facts = _place(part.camera, part.captured_at, part.position, part.pose)
-        shape = geojson_geometry(part.footprint, part.position)
-        facts |= {"status": part.kind, "accuracy_m": part.footprint_accuracy_m, "indices": []}
-        self._features[part.label] = _feature(part.label, shape, facts)
+        facts = _place(part) | {"status": part.kind, "accuracy_m": part.footprint_accuracy_m, "indices": []}
+        self._features[part.label] = _feature(part.label, part, facts)
 
     def write(self, out: Path) -> None:
         """Write the file atomically; remove that of an earlier run if no capture has a position. Raises OutputError."""
@@ -74,16 +71,18 @@ class FlightMap:
         write_text(out / FLIGHT_MAP_FILE, text)
 
 
-def _feature(label: str, shape: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
+def _feature(label: str, capture: Sidecar | PanelOrSkyPart, properties: dict[str, Any]) -> dict[str, Any]:
+    shape = geojson_geometry(capture.footprint, capture.position)
     return {"type": "Feature", "id": label, "geometry": shape, "properties": {"capture": label, **properties}}
 
 
-def _place(camera: CameraIdentity, captured_at: str, position: Position | None, pose: Pose | None) -> dict[str, Any]:
+def _place(capture: Sidecar | PanelOrSkyPart) -> dict[str, Any]:
+    pose = capture.pose
     height_m = None if pose is None else pose.height_m
     return {
-        "camera": camera.name,
-        "captured_at": captured_at,
-        **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
+        "camera": capture.camera.name,
+        "captured_at": capture.captured_at,
+        **{name: getattr(capture.position, name, None) for name in ("longitude", "latitude", "altitude_m")},
         "height_m": None if height_m is None else round(height_m, 1),
         "height_from": None if pose is None or height_m is None else pose.height_from,
         "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,

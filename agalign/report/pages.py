@@ -97,8 +97,7 @@ def _captures(
     All captures have to be read before it is known that the table leaves out rasters that are not masked like most:
     if it does, they are read again, with the rows of the `table`.
     """
-    facts, shown = FlightFacts(out), set[Path]()
-    rows_of: dict[str, list[IndexReport]] = defaultdict(list)
+    facts, rows_of = FlightFacts(out), defaultdict[str, list[IndexReport]](list)
     for row in current_rows(out) if table is None else table:
         # An index that could not be calculated has no raster, whose removal would remove the row.
         if row.path is not None or (out / f"{row.capture}.json").is_file():
@@ -114,11 +113,11 @@ def _captures(
         if table is None:
             rows = merged(rows, reports_of(sidecar, label, out, facts.pairs.run))
         rows_of[label] = rows
-        shown.update(row.path for row in rows if row.path is not None)
         facts.add(label, sidecar, rows)
     if table is None:
-        table = update_table(out, [row for rows in rows_of.values() for row in rows], earlier=[])
-        if shown - {row.path for row in table}:
+        all_rows = [row for rows in rows_of.values() for row in rows]
+        table = update_table(out, all_rows, earlier=[])
+        if table != all_rows:
             return _captures(out, lambda _: None, table)
     return facts
 
