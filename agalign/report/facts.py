@@ -71,10 +71,11 @@ class FlightFacts:
         """Number of captures with a position."""
         self.without_result: Sequence[str] = ()
         """Labels of the captures of the run that have no sidecar."""
+        self.masked: dict[str, list[float]] = defaultdict(list)
+        """Shares of pixels that only the quality flags mask, of the captures with any, by index."""
         self._summary, self._map = CsvTable(SUMMARY_COLUMNS), FlightMap()
         self._rows = DataParts(out, "rows", _ROWS_PER_PART)
         self._details = DataParts(out, "details", _DETAILS_PER_PART, self._take_lattices)
-        self._masked: dict[str, list[float]] = defaultdict(list)
         self._lattices: dict[bytes, int] = {}
         """Centres of windows, which many pairs share, and their index, of the current part of the details."""
         self._first_lattice = 0
@@ -125,7 +126,7 @@ class FlightFacts:
         assert row.path is not None
         known = row.statistics.as_json()
         if row.statistics.masked_share > 0:
-            self._masked[row.index].append(rounded(row.statistics.masked_share))
+            self.masked[row.index].append(rounded(row.statistics.masked_share))
         file = row.path.relative_to(self.out)
         return {name: rounded(known[name]) for name in ("median", "p5", "p95")} | {
             "name": row.index,
@@ -174,10 +175,6 @@ class FlightFacts:
     def files(self) -> list[str]:
         """Names of the data files that the page needs, relative to the output folder."""
         return [*self._rows.files, *self._details.files]
-
-    def masked_shares(self) -> dict[str, list[float]]:
-        """Return the sorted shares of pixels that only the quality flags mask, by index."""
-        return {name: sorted(of_index) for name, of_index in self._masked.items()}
 
     def in_page(self) -> dict[str, Any]:
         """Return the data in the page, after `write`. The script of the page declares their types."""

@@ -35,12 +35,10 @@ class DataParts:
     first: dict[str, Any] | None = None
     """The first part."""
     _records: list[dict[str, Any]] = field(default_factory=list)
-    _count: int = 0
 
     def add(self, record: dict[str, Any]) -> None:
         """Add a record, and end the part if it is full. Raises OutputError."""
         self._records.append(record)
-        self._count += 1
         if len(self._records) == self.size:
             self.flush()
 
@@ -48,8 +46,8 @@ class DataParts:
         """End the current part, with control characters escaped. Raises OutputError."""
         if not self._records and self.first is not None:
             return
-        start = self._count - len(self._records)
-        part = {"from": start, "records": printable(self._records), **self.also()}
+        number = len(self.files) + (self.first is not None)  # of parts before this one, which are full
+        part = {"from": number * self.size, "records": printable(self._records), **self.also()}
         self._records = []
         if self.first is None:
             self.first = part
@@ -57,7 +55,7 @@ class DataParts:
         text = json.dumps(part, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
         # The name contains a checksum: the earlier page, and its data, stand until the new page replaces it.
         digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        file = f"{DATA_FOLDER}/{self.kind}-{len(self.files) + 2}-{digest}.js"
+        file = f"{DATA_FOLDER}/{self.kind}-{number + 1}-{digest}.js"
         check_inside(self.out / DATA_FOLDER, self.out)
         write_text(self.out / file, f"add_{self.kind}({text});\n")
         self.files.append(file)

@@ -88,12 +88,6 @@ class BandTotals:
     largest: ExpectedError | None = None
     """The largest of them."""
 
-    def add_error(self, error: ExpectedError) -> None:
-        """Add the expected error in a capture."""
-        self.errors_px.append(error.std_px)
-        if self.largest is None or error.std_px > self.largest.std_px:
-            self.largest = error
-
 
 @dataclass
 class PairTotals:
@@ -124,9 +118,12 @@ class PairTotals:
                 band.residuals_px.append(part.metrics.after.residual_px)
         for part in result.usable:
             self.usable[str(part.status)] += 1
-            if part.error is not None:
-                error = part.error.std_px, part.error.other_px, label, part.band, part.share_over_1_px
-                self.bands[part.band].add_error(ExpectedError(*error))
+            if (error := part.error) is not None:
+                band = self.bands[part.band]
+                band.errors_px.append(error.std_px)
+                if band.largest is None or error.std_px > band.largest.std_px:
+                    share = part.share_over_1_px
+                    band.largest = ExpectedError(error.std_px, error.other_px, label, part.band, share)
         camera, reference = result.camera, result.reference.band
         of_light = self._light.add(label, f"{camera.name} {camera.unit}", result.captured_at, result.output)
         cautions = [replace(c, capture=label) for c in (*self.run.cautions(result, label), *of_light)]
