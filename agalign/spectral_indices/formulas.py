@@ -11,7 +11,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,6 @@ def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
         return np.asarray(_value(_parsed(formula), values), np.float32)
 
 
-@lru_cache(maxsize=64)
 def _parsed(formula: str) -> ast.expr:
     if len(formula) > _MAX_LENGTH:
         raise ConfigurationError(f"the formula has {len(formula)} characters; at most {_MAX_LENGTH} are allowed")

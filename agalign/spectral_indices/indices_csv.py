@@ -111,9 +111,9 @@ def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
 def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
     """Return the cells of a row, among them those of all columns."""
     folder, capture, _ = row.key
-    place = {"folder": folder, "capture": capture, "input": row.statistics.unit}
     file = "" if row.path is None else row.path.relative_to(out).as_posix()
-    return vars(row) | row.statistics.as_json() | place | {"file": file}
+    others = {"folder": folder, "capture": capture, "input": row.statistics.unit, "file": file}
+    return vars(row) | row.statistics.as_json() | others
 
 
 def _report_of_row(cells: Mapping[str, str], out: Path) -> IndexReport:
