@@ -45,10 +45,9 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
     if mask_qa and flags is None and sidecar.output is not None:
         raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
     checksums = {part.file: part.sha256 for part in sidecar.products}
-    result, names = [], [part.band for part in sidecar.bands]
-    if sidecar.output is not None:
-        names = sidecar.output.bands or names
-    layers, lost = quality_layers(names), _why_without_pixels(sidecar)
+    of_stack = [] if sidecar.output is None else sidecar.output.bands
+    layers = quality_layers(of_stack or [part.band for part in sidecar.bands])
+    result, lost = [], _why_without_pixels(sidecar)
     for part in sidecar.bands:
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layers[part.band], flags.sha256) if mask_qa and flags is not None else None

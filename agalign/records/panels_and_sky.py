@@ -189,8 +189,7 @@ def last_panels_and_sky(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
     """Return the captures of panels and those of the sky; none of a file that cannot be read, which the commands that
     need it name.
     """
-    panels: list[PanelPart] = []
-    sky: list[SkyPart] = []
+    panels, sky = list[PanelPart](), list[SkyPart]()
     with suppress(SidecarError):
         panels = read_panels(out)
     with suppress(SidecarError):

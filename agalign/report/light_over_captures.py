@@ -60,16 +60,15 @@ class _CaptureCells:
     @classmethod
     def of(cls, label: str, captured_at: str, output: OutputPart) -> Self | None:
         """Return the cells of the bands of a capture; None without any."""
-        means = {part.band: part.cell_means for part in output.band_radiometry if part.cell_means is not None}
-        usable = {band: cells for band, cells in means.items() if np.mean(cells > 0) > _MIN_VALID}
+        means = [(part, part.cell_means) for part in output.band_radiometry if part.cell_means is not None]
+        usable = [(part, cells) for part, cells in means if np.mean(cells > 0) > _MIN_VALID]
         if not usable:
             return None
-        cells = np.array([np.log(c, out=np.full_like(c, np.nan), where=c > 0) for c in usable.values()])
+        cells = np.log(np.array([np.where(c > 0, c, np.nan) for _, c in usable]))
+        quantities = {part.quantity or output.radiometry or "" for part, _ in usable}
         time_s = known_time_s(captured_at)
-        quantities = {
-            part.quantity or output.radiometry or "" for part in output.band_radiometry if part.band in usable
-        }
-        return cls(label, math.nan if time_s is None else time_s, quantities, tuple(usable), cells)
+        bands = tuple(part.band for part, _ in usable)
+        return cls(label, math.nan if time_s is None else time_s, quantities, bands, cells)
 
     def apart_s(self, other: Self) -> float:
         """Return the time between two captures."""

@@ -177,15 +177,12 @@ class IndexRasters(Product):
         Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
         """
         base, label = context.paths.file(""), context.capture.label
-        samples = context.sidecar.own_samples
         requested, rasters = chosen_indices(context.settings.write.indices), index_rasters(base)
-        earlier = [raster for raster in rasters if raster.name not in {one.name for one in requested}]
-        if not (requested or earlier):
-            return
+        names, samples = {index.name for index in requested}, context.sidecar.own_samples
         bands, problems = list(_bands(context)), []
         masked = list(_masked(bands, context))
         stay_masked = {raster.name for raster in rasters if raster.is_masked and any(b.quality for b in masked)}
-        wanted = [(index, None) for index in requested] + [(raster.index, raster) for raster in earlier]
+        wanted = [(index, None) for index in requested] + [(r.index, r) for r in rasters if r.name not in names]
         with BandReader() as reader:
             for index, raster in wanted:
                 if index is None:
