@@ -130,7 +130,8 @@ def _report_of_row(cells: Mapping[str, str], out: Path) -> IndexReport:
     )
     path = out / cells["file"]
     path.relative_to(out)  # raises ValueError for an absolute path, which no table has
-    if (raster := IndexRaster.read(path)) is not None:
+    raster = IndexRaster.read(path) if cells["file"] else None
+    if raster is not None:
         return replace(report, path=path, statistics=raster.statistics, is_masked=raster.is_masked)
     if cells["file"] or not report.problem:
         raise ValueError("its raster is missing")
