@@ -114,11 +114,7 @@ def _on_frame(mapping: PixelMapping, frame: OutputGrid, reference: Band) -> Pixe
 
 def common_grid(reference: Band, settings: WriteSettings, limits: FlightLimits) -> OutputGrid | None:
     """Return the grid of all captures of a camera, given the limits of its flights; None if each has its own."""
-    of_flight = [
-        (PixelMapping(matrix, reference.lens, band.lens), band)
-        for matrix, band in limits
-        if (band.lens is None) == (reference.lens is None)
-    ]
+    of_flight = _mappings_of_flight(reference, limits)
     if settings.crop != "flight" or not of_flight:
         return None
     frame = _frame(reference, [mapping for mapping, _ in of_flight], settings)
@@ -134,6 +130,32 @@ def common_grid(reference: Band, settings: WriteSettings, limits: FlightLimits) 
         size_px = area.width - 2 * margin_px, area.height - 2 * margin_px
         area = Tile(area.x0 + margin_px, area.y0 + margin_px, *size_px)
     return replace(frame, **vars(area))
+
+
+def at_finest_scale(
+    common: OutputGrid, reference: Band, settings: WriteSettings, limits: FlightLimits
+) -> OutputGrid | None:
+    """Return the part of the grid of the finest band that a common grid covers, given settings with this resolution and
+    the limits of the flights of the camera; None if there are no limits, which determine the scale.
+    """
+    mappings = [mapping for mapping, _ in _mappings_of_flight(reference, limits)]
+    if not mappings:
+        return None
+    frame = _frame(reference, mappings, settings)
+    scale, decimals = frame.scale.over(common.scale), 6
+    left, top = (math.ceil(round(v, decimals)) for v in np.multiply((common.x0, common.y0), scale))
+    ends = common.x0 + common.width, common.y0 + common.height
+    right, bottom = (math.floor(round(v, decimals)) for v in np.multiply(ends, scale))
+    return replace(frame, x0=left, y0=top, width=right - left, height=bottom - top)
+
+
+def _mappings_of_flight(reference: Band, limits: FlightLimits) -> list[tuple[PixelMapping, Band]]:
+    """The limits as mappings between files, without bands of which only one of both has a lens."""
+    return [
+        (PixelMapping(matrix, reference.lens, band.lens), band)
+        for matrix, band in limits
+        if (band.lens is None) == (reference.lens is None)
+    ]
 
 
 def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:

@@ -25,7 +25,7 @@ from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import with_nodata, write_raster
 from agalign.rasters.geotiff import Block, LayerDescription, compressed
-from agalign.rasters.output_grid import common_grid, output_layers
+from agalign.rasters.output_grid import at_finest_scale, output_layers
 from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.values.capture import Band, Capture
 from agalign.values.image import FloatImage, Mask, Tile
@@ -58,9 +58,11 @@ class PanSharpened(Product):
         broad = panchromatic(capture)
         if not broad or not {b.name for b in broad} <= {capture.reference.name, *usable}:
             return []
+        common, is_fine = context.options.common, context.settings.write.resolution == "finest"
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none", "statistics": False}
         settings = context.settings.write.model_copy(update=fine)
-        common = common_grid(capture.reference, settings, context.options.limits)
+        if common is not None and not is_fine:
+            common = at_finest_scale(common, capture.reference, settings, context.options.limits)
         layers, grid = output_layers(capture, usable, settings, common, context.read)
         context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
         pan = [la for la in layers if la.band in broad]

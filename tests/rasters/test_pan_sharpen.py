@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,8 +12,11 @@ from synthetic_flights.troubles import make_two_headings
 import agalign
 from agalign.pixels.raster import open_raster
 from agalign.rasters.pan_sharpen import PanSharpened, brovey_ratio, panchromatic, sharpened, weights_of
+from agalign.rasters.product import RenderOptions
+from agalign.values import geometry
 from agalign.values.alignment import Prediction
 from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
 from ..conftest import textured_image, write_band
@@ -162,3 +166,20 @@ def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
     for file in files:
         with tifffile.TiffFile(file.path) as image:
             assert "ModelTransformationTag" not in image.pages[0].tags, "no georeference is invented"
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_flight_is_sharpened_in_the_crop_of_its_stacks(tmp_path: Path, scale: int) -> None:
+    """Captures that are added to a finished flight keep its crop, and have another rig."""
+    size_px, crop = (64, 48), OutputGrid(5, 4, 40, 30)
+    red = Band("Red", tmp_path / "red.tif", 1, *size_px, "uint16")
+    pan = Band("Panchro", tmp_path / "pan.tif", 1, *(scale * n for n in size_px), "uint16")
+    for band in (red, pan):
+        write_band(band.path, np.full(band.size_px[::-1], 500, np.uint16))
+    to_pan = np.diag([scale, scale, 1.0])
+    alignments = {pan.name: aligned(PixelMapping(to_pan), size_px)}
+    limits = [(geometry.translation(6.0 * scale, 0.0) @ to_pan, pan)]
+    context = context_of(capture_of(red, pan), alignments, tmp_path)
+    (file,) = PanSharpened().write(replace(context, options=RenderOptions(limits=limits, common=crop)))
+    with rasterio.open(file.path) as sharp:
+        assert (sharp.width, sharp.height) == (scale * crop.width, scale * crop.height)
