@@ -50,6 +50,8 @@ class CaptureReport:
     """Why the capture counts as sky."""
     failed_products: tuple[str, ...] = ()
     """Products that could not be written, and why."""
+    impossible_products: tuple[str, ...] = ()
+    """Requested indices that no run can write, because of the units of the bands, and why."""
     why_kept: str = ""
     """Which input files of an earlier result are lost, so that this run does not replace it; empty if none are."""
     removed: tuple[tuple[Path, str], ...] = ()
@@ -75,7 +77,9 @@ class CaptureReport:
     @property
     def problems(self) -> tuple[str, ...]:
         """Errors, except bands that are not aligned; those are in the sidecar."""
-        return tuple(dict.fromkeys(filter(None, (self.error, *self.failed_products, self.why_kept))))
+        return tuple(
+            dict.fromkeys(filter(None, (self.error, *self.failed_products, *self.impossible_products, self.why_kept)))
+        )
 
     @property
     def summary(self) -> str:

@@ -39,7 +39,7 @@ from agalign.records.sidecar import (
     capture_status,
 )
 from agalign.records.sidecar_file import file_part, write_sidecar
-from agalign.spectral_indices.rasters import index_rasters
+from agalign.spectral_indices.rasters import impossible_indices, index_rasters
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
@@ -100,7 +100,15 @@ def render(
     result = rendered_sidecar(context, list(failures), time.perf_counter() - began_s, gone)
     written_sidecar = write_sidecar(paths.sidecar, result).without_tables()
     failed = tuple(dict.fromkeys(failures.values()))  # products that need the same file fail with the same message
-    return CaptureReport(capture.label, "done", written_sidecar, paths.sidecar, failed_products=failed, removed=reasons)
+    return CaptureReport(
+        capture.label,
+        "done",
+        written_sidecar,
+        paths.sidecar,
+        failed_products=failed,
+        impossible_products=impossible_indices(write.indices, written_sidecar, paths.folder),
+        removed=reasons,
+    )
 
 
 def _gone_indices(sidecar: Sidecar, paths: CapturePaths) -> list[FilePart]:

@@ -44,7 +44,7 @@ from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages, pages_exist, write_pages
 from agalign.report.pair_totals import PairTotals
 from agalign.report.panel_and_sky_files import panel_picture, write_panels, write_sky
-from agalign.spectral_indices.rasters import check_indices
+from agalign.spectral_indices.rasters import check_indices, impossible_indices
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 
@@ -113,7 +113,8 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
             for report in run.reports(selection, record):
                 finished[report.label] = Finished(report.state, seconds=report.seconds)
                 for text in report.problems:
-                    kinds: dict[str | None, ProblemKind] = {report.error: "failed", report.why_kept: "kept"}
+                    kinds: dict[str | None, ProblemKind] = dict.fromkeys(report.impossible_products, "impossible")
+                    kinds |= {report.error: "failed", report.why_kept: "kept"}
                     record.add_problem(report.label, text, kinds.get(text, "not_written"))
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
@@ -405,7 +406,9 @@ class _FlightRun:
         with suppress(SidecarError):
             sidecar, change = self.results(path)
             if not change:
-                return CaptureReport(capture.label, "kept", sidecar, path, why_kept=left.why_kept)
+                impossible = impossible_indices(self.settings.write.indices, sidecar, path.parent)
+                report = CaptureReport(capture.label, "kept", sidecar, path, why_kept=left.why_kept)
+                return replace(report, impossible_products=impossible)
         why = left.why_kept or f"{path}: was changed during the run; the same command estimates the capture again"
         return CaptureReport(capture.label, "error", error=why, why_kept=left.why_kept)
 

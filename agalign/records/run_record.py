@@ -29,9 +29,10 @@ _SCHEMA = "agalign-run/2"
 _MAX_NAMED = 10
 """Captures that a sentence names."""
 RunState = Literal["running", "interrupted", "finished"]
-ProblemKind = Literal["", "skipped", "used", "failed", "kept", "not_written"]
+ProblemKind = Literal["", "skipped", "used", "failed", "kept", "not_written", "impossible"]
 """Of a file: `skipped`, or `used` in spite of the problem. Of a capture: `failed`; `kept` as an earlier run left it,
-because input files are lost; an output was `not_written`. Empty in records of earlier versions.
+because input files are lost; an output was `not_written`, or is `impossible`, as no run can write it. Empty in records
+of earlier versions.
 """
 _IN_WORDS: Mapping[ProblemKind, tuple[str, str]] = {
     "skipped": ("file or capture took no part", "files or captures took no part"),
@@ -39,6 +40,7 @@ _IN_WORDS: Mapping[ProblemKind, tuple[str, str]] = {
     "failed": ("capture could not be processed", "captures could not be processed"),
     "kept": ("capture was kept as it was", "captures were kept as they were"),
     "not_written": ("output was not written", "outputs were not written"),
+    "impossible": ("output is impossible", "outputs are impossible"),
     "": ("problem", "problems"),
 }
 """What one problem of a kind is called, and several."""
@@ -305,7 +307,7 @@ def unfinished_run(
     excluded = {part.label for part in not_aligned if part.is_left_out}
     wanted = [label for label in record.labels if label not in excluded]
     kept = {part.of for part in record.problems if part.kind == "kept"}
-    with_error = {part.of for part in record.problems} - kept
+    with_error = {part.of for part in record.problems if part.kind != "impossible"} - kept
     missing = [label for label in wanted if label not in labels]
     erroneous = [label for label in wanted if label in labels and escape_controls(label) in with_error]
     return UnfinishedRun(

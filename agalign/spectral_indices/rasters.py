@@ -174,7 +174,7 @@ class IndexRasters(Product):
         """Write the indices that were requested and of which the capture has all bands, usable, and those that an
         earlier command wrote. One that a command has masked by quality flags stays masked if there are flags.
 
-        Raises InputError if bands of a requested index are in the wrong unit, or if its raster cannot be written.
+        Raises InputError if the raster of a requested index cannot be written, other than by `impossible_indices`.
         """
         base, label = context.paths.file(""), context.capture.label
         requested, rasters = chosen_indices(context.settings.write.indices), index_rasters(base)
@@ -198,7 +198,11 @@ class IndexRasters(Product):
                     yield WrittenFile(self.kind, report.path.with_suffix(".png"))
                 elif raster is not None:
                     yield LostFile(raster.path, report.problem)
-                elif report.problem not in {b.problem for b in bands} and _has_bands(context.capture.bands, index):
+                elif (
+                    report.problem not in {b.problem for b in bands}
+                    and not _unsuitable_unit(index, bands, reader)
+                    and _has_bands(context.capture.bands, index)
+                ):
                     problems.append(f"{index.name}: {report.problem}")
         if problems:
             raise InputError("; ".join(problems))
@@ -398,6 +402,35 @@ def reason_not_written(index: Index, sidecar: Sidecar, folder: Path) -> str:
     return ""
 
 
+class _UnsuitableUnitError(InputError):
+    """The bands of an index are in units from which it cannot be calculated."""
+
+
+def impossible_indices(names: Sequence[str], sidecar: Sidecar, folder: Path) -> tuple[str, ...]:
+    """Return which of these indices of a capture no run can calculate because of the units of its aligned bands, and
+    why, given the folder of the sidecar.
+    """
+    files = {part.file for part in sidecar.products}
+    missing = [name for name in names if f"{Path(sidecar.capture).name}_{name}.tif" not in files]
+    if not missing:
+        return ()
+    bands = bands_of(sidecar, folder)
+    with BandReader() as reader:
+        reasons = {index.name: _unsuitable_unit(index, bands, reader) for index in chosen_indices(missing)}
+    return tuple(f"{name}: {reason}" for name, reason in reasons.items() if reason)
+
+
+def _unsuitable_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader) -> str:
+    """Return why an index cannot be calculated from the units of its bands; empty if it can, or if one is missing."""
+    try:
+        _common_unit(index, _bands_of_index(bands, index), reader)
+    except _UnsuitableUnitError as error:
+        return str(error)
+    except InputError:
+        pass
+    return ""
+
+
 def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
     """Sixteen hexadecimal digits of everything that an index raster depends on."""
     sources = [(b.sha256, b.band_index) for b in bands]
@@ -430,11 +463,11 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
             raise InputError(f"{path}: differs in size from {files[0][0].name}; run again")
     units = {unit for band in bands for unit in reader.units(band)}
     if len(units) > 1:
-        raise InputError(f"its bands are in different units ({', '.join(sorted(units))})")
+        raise _UnsuitableUnitError(f"its bands are in different units ({', '.join(sorted(units))})")
     (unit,) = units
     if not (index.any_unit or index.is_of_user) and unit not in ("reflectance", UNSTATED):
         remedy = "a calibration panel gives it" if unit == "relative reflectance" else "align with --radiometry"
-        raise InputError(f"needs reflectance, and the bands are {unit}; {remedy}")
+        raise _UnsuitableUnitError(f"needs reflectance, and the bands are {unit}; {remedy}")
     return unit
 
 

@@ -132,6 +132,24 @@ def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
         assert problem in indices_of(tmp_path, index)[0].problem
 
 
+def test_an_index_of_bands_in_different_units_is_a_problem_of_every_run_and_no_damage(tmp_path: Path) -> None:
+    """No run can write it: the capture is kept, and each run says why."""
+    scene, folder, out = textured_image(400, 300, 7), tmp_path / "in", tmp_path / "out"
+    for name, gain in {"green": 900, "red": 600}.items():
+        write_band(folder / f"f_{name}.tif", (3000 + gain * scene).clip(1).astype(np.uint16))
+    write_band(folder / "f_nir.tif", (0.4 + 0.05 * scene).astype(np.float32))
+    settings = agalign.Settings(write=agalign.WriteSettings(indices=("ndvi",)))
+    problem = "ndvi: its bands are in different units (raw numbers, unstated, in the range of reflectance)"
+    for state in ("done", "kept"):
+        report = written(tmp_path, settings)
+        assert (report.state, report.problems, report.is_complete) == (state, (problem,), False)
+        record = read_json(out / "agalign-run.json")
+        assert [(part["kind"], part["problem"]) for part in record["problems"]] == [("impossible", problem)]
+    verified = agalign_here("verify", out)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    assert problem.removeprefix("ndvi: ") in (out / "index.html").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("index", "problem"),
     [("ndre", "no capture has them all; there are green"), ("savi", "needs reflectance; add --radiometry")],
