@@ -4,7 +4,6 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -498,34 +497,20 @@ def _crops_of_cameras(
 def capture_reports(
     run_tasks: RunTasks, tasks: Sequence[Task], listener: Listener, timeout_s: float | None
 ) -> Iterator[CaptureReport]:
-    """Yield the report of each task as it completes. In this process, the listener is called, and the files of the next
-    capture are read into the page cache meanwhile.
-    """
-    if run_tasks is not serially:
-        for number, result in run_tasks(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
-            try:
-                report = _below(result(), tasks[number].out)
-            except Exception as error:
-                report = CaptureReport(tasks[number].capture.label, "error", error=failure_text(error, timeout_s))
-            yield report
-        return
-    with ThreadPoolExecutor(1) as reader:
-        for number, task in enumerate(tasks, start=1):
-            for following in tasks[number : number + 1]:
-                reader.submit(_read_ahead, following.capture)
+    """Yield the report of each task as it completes. In this process, the listener is called."""
+    if run_tasks is serially:
+        for task in tasks:
             yield do_capture(task, partial(listener.on_pair, task.capture))
+        return
+    for number, result in run_tasks(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
+        try:
+            report = _below(result(), tasks[number].out)
+        except Exception as error:
+            report = CaptureReport(tasks[number].capture.label, "error", error=failure_text(error, timeout_s))
+        yield report
 
 
 def _below(report: CaptureReport, out: Path) -> CaptureReport:
     """Return the report of a worker, whose paths are absolute, with paths below the output folder as it was given."""
     removed = tuple((below_as_given(path, out), reason) for path, reason in report.removed)
     return replace(report, path=None if report.path is None else below_as_given(report.path, out), removed=removed)
-
-
-def _read_ahead(capture: Capture) -> None:
-    """Read the files of a capture into the page cache; larger ones could displace files of the current capture."""
-    max_bytes = 64 << 20
-    for path in {b.path for b in capture.bands}:
-        with suppress(OSError):
-            if path.stat().st_size <= max_bytes:
-                path.read_bytes()
