@@ -27,7 +27,7 @@ from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.raster import with_facts_of_pixels
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.capture import Capture
-from agalign.values.geometry import Matrix, PairScales
+from agalign.values.geometry import Matrix
 from agalign.values.residual import Residual
 
 
@@ -61,8 +61,8 @@ class RefinedPair:
 
     seed: Seed
     result: JointResult
-    sizes_px: tuple[tuple[int, int], tuple[int, int]]
-    """(width, height) of the fixed and the moving image."""
+    fixed_to_moving: Matrix
+    """The mapping of the result, px of the files."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +87,16 @@ class LearningCapture:
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
         observation = observed(pairs, result, capture)
         refined = {
-            name: RefinedPair(band.found, band.refined.joint, band.pair.sizes_px)
+            name: RefinedPair(band.found, joint, band.pair.scales.between_files(joint.fixed_to_moving))
             for name, band in estimation.bands.items()
-            if isinstance(band.found, Seed) and band.refined is not None and band.issue is None
+            if isinstance(band.found, Seed) and band.refined and (joint := band.refined.joint) and band.issue is None
         }
         return cls(capture, refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
 
     @property
     def mappings(self) -> dict[str, Matrix]:
         """Refined mappings of the bands with distinguishable held-out patches, px of the files."""
-        result, files_px = {}, {band.name: band.size_px for band in self.capture.bands}
-        for band, pair in self.refined.items():
-            if pair.result.is_retrieved:
-                scales = PairScales.of((self.capture.reference.size_px, files_px[band]), pair.sizes_px)
-                result[band] = scales.between_files(pair.result.fixed_to_moving)
-        return result
+        return {band: pair.fixed_to_moving for band, pair in self.refined.items() if pair.result.is_retrieved}
 
 
 @dataclass(frozen=True)
