@@ -14,7 +14,7 @@ from agalign._version import __version__
 from agalign.batch.output_files import is_same
 from agalign.batch.render import with_earlier_products
 from agalign.cameras.discover import FolderScan
-from agalign.config import RunOptions, Settings, SettingsModel
+from agalign.config import RunOptions, Settings
 from agalign.errors import Reason, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import (
     RENDER_STAGES,
@@ -140,8 +140,7 @@ def remaining(
     if change:
         return Remaining("estimate", (_DAMAGED,))
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
-        stages = [(key, stage) for key, stage in settings if key not in RENDER_STAGES]
-        changed = _changed_options(earlier, settings, stages)
+        changed = _changed_options(earlier, settings, are_of_rendering=False)
         if earlier.agalign != __version__:
             changed = *changed, f"version (agalign {earlier.agalign} before)"
         other = ("input files",) if has_other_files else _changed_selection(earlier, capture)
@@ -179,9 +178,7 @@ def _to_render(
     if not outputs_exist(path, parallax):
         return Remaining("estimate", ("the parallax file",))
     write = with_earlier_products(settings.write, earlier)
-    all_settings = settings.model_copy(update={"write": write})
-    stages = [(key, stage) for key, stage in all_settings if key in RENDER_STAGES]
-    changed = _changed_options(earlier, all_settings, stages)
+    changed = _changed_options(earlier, settings.model_copy(update={"write": write}), are_of_rendering=True)
     if earlier.rendered_with and earlier.rendered_with != render_fingerprint(capture, write, settings.check):
         changed = changed or ("tags, panels or bands of the camera",)
     requested = {f"{capture.name}_{name}.tif" for name in write.indices}
@@ -246,14 +243,15 @@ def _changed_selection(earlier: Sidecar, capture: Capture) -> tuple[str, ...]:
     return ("--reference",) if earlier.reference.band != capture.reference.name else ("tags of the camera",)
 
 
-def _changed_options(
-    earlier: Sidecar, settings: Settings, stages: Sequence[tuple[str, SettingsModel]]
-) -> tuple[str, ...]:
-    """Return the flags of the options of some stages that have changed; indices are changed if some are missing."""
+def _changed_options(earlier: Sidecar, settings: Settings, *, are_of_rendering: bool) -> tuple[str, ...]:
+    """Return the flags of the options that have changed, either those that only render or the others; indices are
+    changed if some are missing.
+    """
     before, now = earlier.options or {}, settings.model_dump(mode="json", exclude_defaults=True)
     return tuple(
         type(stage).flag(name)
-        for key, stage in stages
+        for key, stage in settings
+        if (key in RENDER_STAGES) == are_of_rendering
         for name in type(stage).model_fields
         if before.get(key, {}).get(name) != now.get(key, {}).get(name)
         and not (name == "indices" and _has_indices(earlier, settings.write.indices))
