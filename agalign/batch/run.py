@@ -92,10 +92,7 @@ def run_flight(
     ConfigurationError for `model`, ConfigurationError for a device, for results of other captures of the same name, and
     for a radiometry or georeference that no capture has the tags for.
     """
-    run = _FlightRun(flight, out, settings, options or RunOptions(), listener or Listener())
-    run.check()
-    if model is not None:
-        run = run.starting_from(model)
+    run = _FlightRun(flight, out, settings, options or RunOptions(), listener or Listener()).checked(model)
     with locked(out):
         # What can be refused is refused before the record and the pages of an earlier run are touched.
         yield from _run_selected(run, run.selected())
@@ -110,20 +107,19 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
     with _recorded(run) as record:
         try:
             for report in run.reports(selection, record):
-                finished[report.label] = Finished(report.state, seconds=report.seconds)
                 for text in report.problems:
                     kinds: dict[str | None, ProblemKind] = dict.fromkeys(report.impossible_products, "impossible")
                     kinds |= {report.error: "failed", report.why_kept: "kept"}
                     record.add_problem(report.label, text, kinds.get(text, "not_written"))
                 for (_, stage), seconds in report.stages.items():
                     record.stage_seconds[stage] += seconds
+                one = Finished(report.state, seconds=report.seconds)
                 if report.result is not None and report.path is not None:
                     # A finished capture may lack an index raster, which only `agalign indices` restores.
                     here = [p for p in report.result.files if earlier_results.outputs_exist(report.path, [p])]
-                    finished[report.label] = Finished(
-                        report.state, report.result.pairs, report.path, here, report.seconds
-                    )
+                    one = replace(one, pairs=report.result.pairs, sidecar=report.path, files=here)
                     record.file_states[report.label] = run.file_states(report, report.path.parent, here)
+                finished[report.label] = one
                 if time.monotonic() - saved > _SAVED_EVERY_S:  # for the case that the run is killed
                     saved = time.monotonic()
                     record.count(finished)
@@ -151,10 +147,7 @@ def plan_run(
     Only after learning is it known whether the crop of the flight changes, and finished captures are rendered again.
     Raises InputError and ConfigurationError like `run_flight` does.
     """
-    run = _FlightRun(flight, out, settings, options or RunOptions())
-    run.check()
-    if model is not None:
-        run = run.starting_from(model)
+    run = _FlightRun(flight, out, settings, options or RunOptions()).checked(model)
     selection = run.selected()
     states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
     states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}
@@ -223,8 +216,10 @@ class _FlightRun:
     """Model to start from."""
     results: EarlierResults = field(default_factory=EarlierResults)
 
-    def check(self) -> None:
-        """Raise ConfigurationError for a device, an index or an output folder that cannot be used."""
+    def checked(self, model: Path | None) -> Self:
+        """Return the run, with a model to start from if one is given. Raises ConfigurationError for a device, an index,
+        an output folder or a model that cannot be used.
+        """
         if not name_problem(self.out) and (problem := path_problem(self.out)):
             raise ConfigurationError(f"{problem}, or choose another output folder with -o")
         choose_device(self.settings.joint.device)
@@ -238,8 +233,9 @@ class _FlightRun:
             output_files.refuse_results_elsewhere(self.flight.captures, self.out, self.results)
         output_files.refuse_foreign_run_files(self.out)
         check_inside(self.out / MODELS_FOLDER, self.out)
+        return self if model is None else self._starting_from(model)
 
-    def starting_from(self, path: Path) -> Self:
+    def _starting_from(self, path: Path) -> Self:
         """Return the run with a model. Raises ConfigurationError if it does not fit the settings or the cameras."""
         settings = self.settings
         if not settings.learns_flights:
