@@ -104,15 +104,15 @@ def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: Writ
 
 def _check_product(product: Product, captures: Sequence[Capture]) -> None:
     """Raise ConfigurationError if no capture has what a product needs."""
-    problem: AgalignError | None = None
+    problems = []
     for capture in captures:
         try:
             product.check(capture)
             return
         except AgalignError as error:
-            problem = problem or error
-    if problem is not None:
-        raise ConfigurationError(str(problem))
+            problems.append(str(error))
+    if problems:
+        raise ConfigurationError(problems[0])
 
 
 @dataclass(frozen=True)
