@@ -200,7 +200,7 @@ class IndexRasters(Product):
                     yield LostFile(raster.path, report.problem)
                 elif (
                     report.problem not in {b.problem for b in bands}
-                    and not _unsuitable_unit(index, bands, reader)
+                    and not isinstance(_obstacle(index, bands, reader), _UnsuitableUnitError)
                     and _has_bands(context.capture.bands, index)
                 ):
                     problems.append(f"{index.name}: {report.problem}")
@@ -395,11 +395,7 @@ def reason_not_written(index: Index, sidecar: Sidecar, folder: Path) -> str:
     empty if it can.
     """
     with BandReader() as reader:
-        try:
-            _common_unit(index, _bands_of_index(bands_of(sidecar, folder), index), reader)
-        except InputError as error:
-            return str(error)
-    return ""
+        return str(_obstacle(index, bands_of(sidecar, folder), reader) or "")
 
 
 class _UnsuitableUnitError(InputError):
@@ -416,19 +412,17 @@ def impossible_indices(names: Sequence[str], sidecar: Sidecar, folder: Path) -> 
         return ()
     bands = bands_of(sidecar, folder)
     with BandReader() as reader:
-        reasons = {index.name: _unsuitable_unit(index, bands, reader) for index in chosen_indices(missing)}
-    return tuple(f"{name}: {reason}" for name, reason in reasons.items() if reason)
+        obstacles = {index.name: _obstacle(index, bands, reader) for index in chosen_indices(missing)}
+    return tuple(f"{name}: {error}" for name, error in obstacles.items() if isinstance(error, _UnsuitableUnitError))
 
 
-def _unsuitable_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader) -> str:
-    """Return why an index cannot be calculated from the units of its bands; empty if it can, or if one is missing."""
+def _obstacle(index: Index, bands: Sequence[AlignedBand], reader: BandReader) -> InputError | None:
+    """Return why an index cannot be calculated from the bands of a capture; None if it can."""
     try:
         _common_unit(index, _bands_of_index(bands, index), reader)
-    except _UnsuitableUnitError as error:
-        return str(error)
-    except InputError:
-        pass
-    return ""
+    except InputError as error:
+        return error
+    return None
 
 
 def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
