@@ -2,8 +2,7 @@
 
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -13,19 +12,19 @@ from typing import Self
 from agalign.batch import earlier_results, output_files
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
+from agalign.batch.crops import Flight, crop_key, grids_of_cameras
 from agalign.batch.earlier_results import PROCESSING, EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.model_files import ModelFiles
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
 from agalign.cameras.discover import FolderScan
-from agalign.config import RunOptions, Settings, WriteSettings
+from agalign.config import RunOptions, Settings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.fingerprint import learning_fingerprint
-from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of
+from agalign.flight.groups import difference, flight_camera, flights_of, is_flight_of
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panel_readings import PanelReading
-from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
 from agalign.host.files import MODELS_FOLDER, below_as_given, check_inside, path_problem, written_below
@@ -34,7 +33,6 @@ from agalign.host.own_files import refuse_foreign
 from agalign.host.processes import cores_for
 from agalign.host.text import counted, name_problem
 from agalign.method.device import choose_device, limit_threads
-from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.product import CapturePaths, RenderOptions
 from agalign.records.listed_files import states_of
 from agalign.records.panels_and_sky import last_panels_and_sky
@@ -49,8 +47,6 @@ from agalign.values.image import OutputGrid
 
 _SAVED_EVERY_S = 60.0
 """Time between two writings of the run record during a run."""
-_Flight = tuple[list[Capture], Path | None]
-"""Captures of a flight, and the file of its model."""
 
 
 @dataclass(frozen=True)
@@ -368,7 +364,7 @@ class _FlightRun:
                 plan.grids[capture.label] = grid
         return plan
 
-    def _flights(self, plan: "_Plan", learn: Callable[..., FlightModel | None], record: RunPart) -> Iterator[_Flight]:
+    def _flights(self, plan: "_Plan", learn: Callable[..., FlightModel | None], record: RunPart) -> Iterator[Flight]:
         """Yield the flights with the files of their models, which are learned where something needs them."""
         files = ModelFiles(self.out)
         for group in flights_of(plan.captures):
@@ -382,18 +378,18 @@ class _FlightRun:
             yield group, model
 
     def _renderings(
-        self, flights: Iterable[_Flight], plan: "_Plan"
+        self, flights: Iterable[Flight], plan: "_Plan"
     ) -> Iterator[tuple[Capture, Path | None, RenderOptions]]:
         """Yield each capture with the model of its flight and how it is rendered; with another crop, it is again."""
         flights = list(flights)
-        crops = _crops_of_cameras(flights, plan.grids, self.settings.write)
+        grids = grids_of_cameras(flights, plan.grids, self.settings.write, self.out)
         for group, model in flights:
             for capture in group:
-                limits, common = crops[_crop_key(capture)]
+                common, fine = grids[crop_key(capture)]
                 is_finished = plan.left[capture.label].step == "nothing"
                 if is_finished and common is not None and plan.grids.get(capture.label) not in (None, common):
                     plan.left[capture.label] = Remaining("render", ("crop of the flight",))
-                yield capture, model, RenderOptions(len(self.flight.captures), limits, common)
+                yield capture, model, RenderOptions(len(self.flight.captures), common, fine)
 
     def _kept(self, capture: Capture, left: Remaining) -> CaptureReport:
         """Return the report of a capture that this run does not process."""
@@ -457,37 +453,6 @@ def _is_model(path: Path) -> bool:
         read_rig(path)
         return True
     return False
-
-
-def _crop_key(capture: Capture) -> tuple[str, bool]:
-    """The camera, and whether its reference can be undistorted."""
-    return camera_key(capture), capture.reference.lens is None
-
-
-def _crops_of_cameras(
-    flights: Sequence[_Flight], kept: Mapping[str, OutputGrid], settings: WriteSettings
-) -> dict[tuple[str, bool], tuple[FlightLimits, OutputGrid | None]]:
-    """The limits of the flights and the common grid of each camera: that of most of its `kept` captures, given by
-    label, if they are enough for a rig, else that of the rigs of its flights.
-    """
-    by_camera: dict[str, list[tuple[Sequence[Capture], Rig | None]]] = {}
-    for captures, path in flights:
-        rig = None
-        with suppress(InputError):  # of an earlier run
-            rig = None if path is None else read_rig(path)[1]
-        by_camera.setdefault(camera_key(captures[0]), []).append((captures, rig))
-    result = {}
-    every = [c for captures, _ in flights for c in captures]
-    for key, capture in {_crop_key(c): c for c in every}.items():
-        limits = flight_limits(by_camera[key[0]])
-        grid = common_grid(capture.reference, settings, limits)
-        earlier = Counter(kept[c.label] for c in every if _crop_key(c) == key and c.label in kept)
-        most, count = next(iter(earlier.most_common(1)), (None, 0))
-        # Without rigs, each capture has its own grid.
-        if settings.crop == "flight" and count >= MIN_CAPTURES and (grid is not None or len(earlier) == 1):
-            grid = most
-        result[key] = limits, grid
-    return result
 
 
 def capture_reports(

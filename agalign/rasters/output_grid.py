@@ -21,6 +21,8 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.radiometry import Radiometry
 
+SCALE_DECIMALS = 2
+"""Of pixels of the finest band per pixel of the reference."""
 _MAX_CELL_PX, _MIN_CELLS = 8, 64
 """The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""
 
@@ -133,20 +135,21 @@ def common_grid(reference: Band, settings: WriteSettings, limits: FlightLimits) 
 
 
 def at_finest_scale(
-    common: OutputGrid, reference: Band, settings: WriteSettings, limits: FlightLimits
+    common: OutputGrid, reference: Band, limits: FlightLimits, scale: float | None = None
 ) -> OutputGrid | None:
-    """Return the part of the grid of the finest band that a common grid covers, given settings with this resolution and
-    the limits of the flights of the camera; None if there are no limits, which determine the scale.
+    """Return the pixels of the finest band in a common grid, given the limits of the flights of the camera. `scale` is
+    that of earlier files, which another rig may have determined; None without a scale and limits.
     """
     mappings = [mapping for mapping, _ in _mappings_of_flight(reference, limits)]
-    if not mappings:
+    if scale is None and not mappings:
         return None
-    frame = _frame(reference, mappings, settings)
-    scale, decimals = frame.scale.over(common.scale), 6
-    left, top = (math.ceil(round(v, decimals)) for v in np.multiply((common.x0, common.y0), scale))
+    frame_px = np.multiply(reference.size_px, _finest_scale(mappings, reference) if scale is None else scale)
+    fine = PixelScale.between(reference.size_px, (round(float(frame_px[0])), round(float(frame_px[1]))))
+    factor, decimals = fine.over(common.scale), 6
+    left, top = (math.ceil(round(v, decimals)) for v in np.multiply((common.x0, common.y0), factor).tolist())
     ends = common.x0 + common.width, common.y0 + common.height
-    right, bottom = (math.floor(round(v, decimals)) for v in np.multiply(ends, scale))
-    return replace(frame, x0=left, y0=top, width=right - left, height=bottom - top)
+    right, bottom = (math.floor(round(v, decimals)) for v in np.multiply(ends, factor).tolist())
+    return OutputGrid(left, top, right - left, bottom - top, fine, common.undistorted)
 
 
 def _mappings_of_flight(reference: Band, limits: FlightLimits) -> list[tuple[PixelMapping, Band]]:
@@ -179,7 +182,7 @@ def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
     for mapping in mappings:
         jacobian = np.stack([mapping(centre + d) - mapping(centre - d) for d in 0.5 * np.eye(2)])
         finest = max(finest, math.sqrt(abs(float(np.linalg.det(jacobian)))))
-    return round(finest, 2)
+    return round(finest, SCALE_DECIMALS)
 
 
 def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height_px: int) -> Tile | None:

@@ -10,7 +10,9 @@ which is 1 only on average. Bands outside the range of P are resampled and not s
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,16 +21,16 @@ from rasterio.windows import Window
 from scipy.optimize import nnls
 
 from agalign.cameras.base import is_thermal
-from agalign.errors import InputError
+from agalign.errors import InputError, UnreadableFileError
 from agalign.host.files import scratch_file
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import with_nodata, write_raster
 from agalign.rasters.geotiff import Block, LayerDescription, compressed
-from agalign.rasters.output_grid import at_finest_scale, output_layers
+from agalign.rasters.output_grid import SCALE_DECIMALS, output_layers
 from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.values.capture import Band, Capture
-from agalign.values.image import FloatImage, Mask, Tile
+from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.resampling import as_type, tiles
 
 _TILE_PX = 1024
@@ -58,12 +60,9 @@ class PanSharpened(Product):
         broad = panchromatic(capture)
         if not broad or not {b.name for b in broad} <= {capture.reference.name, *usable}:
             return []
-        common, is_fine = context.options.common, context.settings.write.resolution == "finest"
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none", "statistics": False}
         settings = context.settings.write.model_copy(update=fine)
-        if common is not None and not is_fine:
-            common = at_finest_scale(common, capture.reference, settings, context.options.limits)
-        layers, grid = output_layers(capture, usable, settings, common, context.read)
+        layers, grid = output_layers(capture, usable, settings, context.options.fine, context.read)
         context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
         pan = [la for la in layers if la.band in broad]
         others = [
@@ -81,6 +80,15 @@ class PanSharpened(Product):
                 options = compressed(np.dtype(file.dtypes[0]).kind) | {"interleave": "band", "nodata": file.nodata}
                 more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
                 return self.write_layers(context, descriptions, blocks, **more)
+
+
+def scale_of_earlier(path: Path, common: OutputGrid) -> float | None:
+    """Return the pixels of an earlier pan-sharpened file per pixel of the reference, given the common grid of the
+    stacks; None if it cannot be read.
+    """
+    with suppress(UnreadableFileError), open_raster(path) as file:
+        return round(float(common.scale.x * file.width / common.width), SCALE_DECIMALS)
+    return None
 
 
 def panchromatic(capture: Capture) -> list[Band]:

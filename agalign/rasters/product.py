@@ -13,7 +13,7 @@ from agalign.host.files import file_checksum
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.drawing import Grey, ReducedBands, read_reduced_bands
 from agalign.rasters.geotiff import Block, LayerDescription, write_on_grid
-from agalign.rasters.output_grid import FlightLimits, Layer
+from agalign.rasters.output_grid import Layer
 from agalign.records.sidecar import PreviewPart, Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -90,10 +90,10 @@ class RenderOptions:
 
     captures: int = 1
     """Number of captures of the run, whose previews together have a limited size."""
-    limits: FlightLimits = ()
-    """Limits of all flights of the camera, as far as their rigs are known."""
     common: OutputGrid | None = None
     """Grid of the captures of the camera, if they share one."""
+    fine: OutputGrid | None = None
+    """The same area in pixels of the finest band, for pan-sharpened files."""
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 
 import agalign
+from agalign.batch.crops import grids_of_cameras
 from agalign.batch.earlier_results import EarlierResults, Remaining, remaining
 from agalign.batch.output_files import is_same
-from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
+from agalign.batch.run import Listener, plan_run, run_flight
 from agalign.batch.workers import RunTasks, open_workers
 from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
 from agalign.flight.groups import model_name
+from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar_file import find_sidecars, read_checked, read_sidecar, write_sidecar
 from agalign.values.image import OutputGrid
 
@@ -198,7 +200,8 @@ def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp
     def grid(model: Path | None, *kept: OutputGrid, crop: str = "flight") -> OutputGrid | None:
         grids = dict(zip((c.label for c in captures), kept, strict=False))
         settings = agalign.WriteSettings(crop=crop)
-        ((_, result),) = _crops_of_cameras([(captures, model)], grids, settings).values()
+        ((result, fine),) = grids_of_cameras([(captures, model)], grids, settings, tmp_path).values()
+        assert (fine is None) == (result is None or model is None)
         return result
 
     model, first, second = tmp_path / "m.safetensors", OutputGrid(4, 4, 400, 300), OutputGrid(5, 4, 400, 301)
@@ -209,6 +212,12 @@ def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp
     assert grid(None, first, first, first) == first
     assert grid(None, first, first, first, second) is None
     assert grid(model, first, first, first, crop="common") is None
+    # Its pan-sharpened files keep their scale.
+    write_band(CapturePaths.of(captures[1], tmp_path).file(".pan.tif"), np.zeros((525, 700), np.uint16))
+    kept = {c.label: first for c in captures[:3]}
+    ((_, fine),) = grids_of_cameras([(captures, model)], kept, SEEDS.write, tmp_path).values()
+    assert fine is not None
+    assert (fine.x0, fine.y0, fine.width, fine.height) == (7, 7, 700, 525)
 
 
 def test_finished_captures_get_the_crop_of_a_new_rig(flight: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,9 @@ import agalign
 from agalign.batch import flight_learning as batch_learn
 from agalign.batch import learning_tasks
 from agalign.batch.capture_report import CaptureReport
+from agalign.batch.crops import limits_of_cameras
 from agalign.batch.model_files import ModelFiles
-from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
+from agalign.batch.run import plan_run, run_flight
 from agalign.batch.workers import Completed
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions
@@ -201,7 +202,7 @@ def test_flights_of_one_camera_share_the_limits_of_their_crop(flight: Path, tmp_
     captures, models = (one, other, one, other), (good, None, bad, good)
     flights = [([replace(c, flight_id=str(k))], m) for k, (c, m) in enumerate(zip(captures, models, strict=True))]
     flights.append(([replace(one, camera=replace(one.camera, serial="X9"))], None))
-    (of_first, _), (of_other, _) = _crops_of_cameras(flights, {}, SETTINGS.write).values()
+    of_first, of_other = limits_of_cameras(flights).values()
     assert {band.name for _, band in of_first} == {"NIR"}
     assert len(of_first) == 2 * len(extreme_mappings(read_rig(good)[1], "NIR"))
     assert not of_other

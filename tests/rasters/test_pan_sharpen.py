@@ -11,13 +11,22 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.pixels.raster import open_raster
-from agalign.rasters.pan_sharpen import PanSharpened, brovey_ratio, panchromatic, sharpened, weights_of
+from agalign.rasters.output_grid import at_finest_scale
+from agalign.rasters.pan_sharpen import (
+    PanSharpened,
+    brovey_ratio,
+    panchromatic,
+    scale_of_earlier,
+    sharpened,
+    weights_of,
+)
 from agalign.rasters.product import RenderOptions
 from agalign.values import geometry
 from agalign.values.alignment import Prediction
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import PixelScale
 
 from ..conftest import textured_image, write_band
 from ..run_outputs import aligned, context_of
@@ -180,6 +189,11 @@ def test_a_flight_is_sharpened_in_the_crop_of_its_stacks(tmp_path: Path, scale: 
     alignments = {pan.name: aligned(PixelMapping(to_pan), size_px)}
     limits = [(geometry.translation(6.0 * scale, 0.0) @ to_pan, pan)]
     context = context_of(capture_of(red, pan), alignments, tmp_path)
-    (file,) = PanSharpened().write(replace(context, options=RenderOptions(limits=limits, common=crop)))
+    fine = at_finest_scale(crop, red, limits)
+    (file,) = PanSharpened().write(replace(context, options=RenderOptions(common=crop, fine=fine)))
     with rasterio.open(file.path) as sharp:
         assert (sharp.width, sharp.height) == (scale * crop.width, scale * crop.height)
+    assert scale_of_earlier(file.path, crop) == scale
+    assert scale_of_earlier(red.path.with_suffix(".json"), crop) is None
+    assert at_finest_scale(crop, red, limits, 1.5) == OutputGrid(8, 6, 59, 45, PixelScale(1.5, 1.5))
+    assert at_finest_scale(crop, red, []) is None
