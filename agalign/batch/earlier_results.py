@@ -14,7 +14,7 @@ from agalign._version import __version__
 from agalign.batch.output_files import is_same
 from agalign.batch.render import with_earlier_products
 from agalign.cameras.discover import FolderScan
-from agalign.config import RunOptions, Settings
+from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import Reason, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import (
     RENDER_STAGES,
@@ -25,6 +25,7 @@ from agalign.flight.fingerprint import (
     render_fingerprint,
 )
 from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.text import counted
 from agalign.pixels.raster import read_tile
 from agalign.rasters.product import CapturePaths
 from agalign.records.listed_files import file_problem, states_of
@@ -33,7 +34,7 @@ from agalign.records.sidecar import FilePart, Sidecar, capture_status
 from agalign.records.sidecar_file import find_sidecars, label_of, read_checked, read_sidecar, read_with_change
 from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.capture import Band, Capture
-from agalign.values.image import Tile
+from agalign.values.image import OutputGrid, Tile
 from agalign.values.resampling import tiles
 
 _DAMAGED = "the sidecar (edited or damaged)"
@@ -82,8 +83,6 @@ class EarlierResults:
 
 
 Step = Literal["nothing", "keep", "render", "estimate"]
-PROCESSING: Sequence[Step] = "estimate", "render"
-"""The steps that process a capture."""
 _IN_WORDS: Mapping[Step, str] = {
     "nothing": "kept from an earlier run",
     "keep": "kept from an earlier run, as input files are missing or damaged now",
@@ -102,15 +101,15 @@ class Remaining:
     """
     changed: tuple[str, ...] = ()
     """What has changed since an earlier command has done it; empty if none has."""
-    earlier: Sidecar | None = None
-    """The result of the earlier command, without its tables, if the estimation is kept."""
+    grid: OutputGrid | None = None
+    """Grid of the rasters of the earlier command, if the estimation is kept and this run makes the same grids."""
     why_kept: str = ""
     """The lost files and the remedy, for the step `keep`."""
 
     @property
     def is_processed(self) -> bool:
         """True if a run processes the capture, and does not keep it."""
-        return self.step in PROCESSING
+        return self.step in ("estimate", "render")
 
     @property
     def in_words(self) -> str:
@@ -119,6 +118,16 @@ class Remaining:
             return _IN_WORDS[self.step]
         again = "estimated" if self.step == "estimate" else "rendered"
         return f"to be {again} again; changed since: {', '.join(self.changed)}"
+
+
+def changes(captures: Iterable[Remaining]) -> Iterator[str]:
+    """Yield, in words, which finished captures are processed again, and why."""
+    steps: Sequence[Step] = "estimate", "render"
+    for step in steps:
+        again = [one.changed for one in captures if one.step == step and one.changed]
+        if again:
+            changed = tuple(dict.fromkeys(name for names in again for name in names))
+            yield f"{counted(len(again), 'finished capture')} {Remaining(step, changed).in_words}"
 
 
 def remaining(
@@ -136,7 +145,8 @@ def remaining(
         return _after_damage(path, capture, options)
     has_other_files, lost = _compared_files(earlier, capture)
     if lost and not options.overwrite:
-        return _kept(lost, f"the sidecar {change.what}" if change else "", None if change else earlier)
+        damage = f"the sidecar {change.what}" if change else ""
+        return _kept(lost, damage, None if change else _earlier_grid(earlier, settings.write))
     if change:
         return Remaining("estimate", (_DAMAGED,))
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
@@ -164,10 +174,10 @@ def _after_damage(path: Path, capture: Capture, options: RunOptions) -> Remainin
     return Remaining("estimate", (_DAMAGED,))
 
 
-def _kept(lost: Sequence[str], damage: str, earlier: Sidecar | None) -> Remaining:
+def _kept(lost: Sequence[str], damage: str, grid: OutputGrid | None) -> Remaining:
     remedy = "copy such files from the card again, or align without them by --overwrite"
     state = f"not processed, as {damage}" if damage else "kept as aligned before"
-    return Remaining("keep", (), earlier, f"{state}, and now {'; '.join(lost)}; {remedy}")
+    return Remaining("keep", (), grid, f"{state}, and now {'; '.join(lost)}; {remedy}")
 
 
 def _to_render(
@@ -185,14 +195,22 @@ def _to_render(
     if not outputs_exist(path, [part for part in earlier.products if part.kind != "index" or part.file in requested]):
         changed = (*changed, "files that are missing")
     is_finished = not changed and not earlier.not_written and earlier.rendered_with
+    grid = _earlier_grid(earlier, settings.write)
     differing = results.changed_files(capture.label, path.parent, earlier.files if is_finished else parallax)
     if parallax and parallax[0] in differing:
         return Remaining("estimate", ("the parallax file",))
     # Only `agalign indices` restores an index raster that is missing or unreadable, and its picture.
     readable = {raster.path.stem for raster in (index_rasters(path.with_suffix("")) if differing else [])}
     if any(part.kind != "index" or Path(part.file).stem in readable for part in differing):
-        return Remaining("render", ("files that are not as they were written",), earlier)
-    return Remaining("nothing" if is_finished else "render", changed, earlier)
+        return Remaining("render", ("files that are not as they were written",), grid)
+    return Remaining("nothing" if is_finished else "render", changed, grid)
+
+
+def _earlier_grid(earlier: Sidecar, settings: WriteSettings) -> OutputGrid | None:
+    """Return the grid of the rasters of an earlier result if these settings make the same; None without any."""
+    before, now = earlier.write_options, settings.model_dump(mode="json", exclude_defaults=True)
+    is_same = all(before.get(name) == now.get(name) for name in ("crop", "resolution", "undistort"))
+    return earlier.output.grid if earlier.output is not None and is_same else None
 
 
 def _compared_files(earlier: Sidecar, capture: Capture) -> tuple[bool, list[str]]:

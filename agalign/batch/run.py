@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -13,7 +13,7 @@ from agalign.batch import earlier_results, output_files
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
 from agalign.batch.crops import Flight, crop_key, grids_of_cameras
-from agalign.batch.earlier_results import PROCESSING, EarlierResults, Remaining
+from agalign.batch.earlier_results import EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.model_files import ModelFiles
 from agalign.batch.selection import Selection, select_captures
@@ -43,7 +43,6 @@ from agalign.report.pair_totals import PairTotals
 from agalign.report.panel_and_sky_files import panel_picture, write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices, impossible_indices
 from agalign.values.capture import Capture
-from agalign.values.image import OutputGrid
 
 _SAVED_EVERY_S = 60.0
 """Time between two writings of the run record during a run."""
@@ -175,30 +174,6 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     run.end(record, "finished", time.monotonic() - began, earlier)
 
 
-@dataclass
-class _Plan:
-    """What a run has to do with each capture, given the results of earlier runs."""
-
-    captures: Sequence[Capture]
-    left: dict[str, Remaining] = field(default_factory=dict)
-    """What remains to be done, by label, without the earlier results."""
-    grids: dict[str, OutputGrid] = field(default_factory=dict)
-    """Grids of the earlier results, whose sidecars of a season would not fit into memory."""
-
-    @property
-    def number(self) -> int:
-        """Number of captures that are processed."""
-        return sum(one.is_processed for one in self.left.values())
-
-    def changes(self) -> Iterator[str]:
-        """Yield, in words, which finished captures are processed again, and why."""
-        for step in PROCESSING:
-            again = [one.changed for one in self.left.values() if one.step == step and one.changed]
-            if again:
-                changed = tuple(dict.fromkeys(name for names in again for name in names))
-                yield f"{counted(len(again), 'finished capture')} {Remaining(step, changed).in_words}"
-
-
 @dataclass(frozen=True)
 class _FlightRun:
     """The steps of `run_flight`."""
@@ -307,32 +282,35 @@ class _FlightRun:
         """Learn the model of each flight, keep finished captures and process the others; yield their reports as they
         complete.
         """
-        plan, timeout_s = self._plan(captures), self.options.timeout_s
+        left, timeout_s = {c.label: self.remaining(c) for c in captures}, self.options.timeout_s
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = cores_for(self.options.jobs or (0 if on_cpu else 1))  # a GPU serves one process
         has_timeout = timeout_s is not None
-        numbers = partial(numbers_of_workers, cores=cores, has_timeout=has_timeout)
+
+        def numbers() -> tuple[int, int]:
+            to_process = sum(one.is_processed for one in left.values())
+            return numbers_of_workers(to_process, cores, has_timeout=has_timeout)
 
         def workers(processes: int, threads: int) -> AbstractContextManager[RunTasks]:
             return open_workers(self.options.executor, processes, limit_threads, threads, has_timeout=has_timeout)
 
         with ExitStack() as stack:
-            of_plan = numbers(plan.number)
-            run_tasks = stack.enter_context(workers(*of_plan))
+            before_learning = numbers()
+            run_tasks = stack.enter_context(workers(*before_learning))
             learn = partial(learn_flight, run_tasks=run_tasks, threads=min(MAX_THREADS, cores), timeout_s=timeout_s)
             tasks = []
-            renderings = list(self._renderings(self._flights(plan, learn, record), plan))
-            if (of_tasks := numbers(plan.number)) != of_plan:  # finished captures get the crop of the new model
+            renderings = list(self._renderings([*self._flights(captures, left, learn, record)], left))
+            if numbers() != before_learning:  # finished captures get the crop of the new model
                 stack.close()
-                run_tasks = stack.enter_context(workers(*of_tasks))
+                run_tasks = stack.enter_context(workers(*numbers()))
             for capture, model, rendering in renderings:
-                one = plan.left[capture.label]
+                one = left[capture.label]
                 if not one.is_processed:
                     yield self._kept(capture, one)
                     continue
                 is_estimated = one.step == "render"
                 tasks.append(Task(capture, self.out, self.settings, model, rendering, is_estimated=is_estimated))
-            for message in plan.changes():
+            for message in earlier_results.changes(left.values()):
                 self.listener.on_again(message)
             yield from capture_reports(run_tasks, tasks, self.listener, timeout_s)
 
@@ -354,41 +332,41 @@ class _FlightRun:
         finally:
             self.listener.on_end(record, pairs)
 
-    def _plan(self, captures: Sequence[Capture]) -> "_Plan":
-        """Compare the captures with the results of earlier runs."""
-        plan = _Plan(captures)
-        for capture in captures:
-            one = self.remaining(capture)
-            plan.left[capture.label] = replace(one, earlier=None)
-            if (grid := self._earlier_grid(one)) is not None:
-                plan.grids[capture.label] = grid
-        return plan
-
-    def _flights(self, plan: "_Plan", learn: Callable[..., FlightModel | None], record: RunPart) -> Iterator[Flight]:
-        """Yield the flights with the files of their models, which are learned where something needs them."""
+    def _flights(
+        self,
+        captures: Sequence[Capture],
+        left: Mapping[str, Remaining],
+        learn: Callable[..., FlightModel | None],
+        record: RunPart,
+    ) -> Iterator[Flight]:
+        """Yield the flights with the files of their models, which are learned where something needs them; `left` is
+        what remains to be done, by label.
+        """
         files = ModelFiles(self.out)
-        for group in flights_of(plan.captures):
+        for group in flights_of(captures):
             used = {self.results.models.get(CapturePaths.of(c, self.out).sidecar, "") for c in group} - {""}
             path = files.find(group, used)
             model = path if path is not None and _is_model(path) else None
-            steps = {plan.left[c.label].step for c in group}
+            steps = {left[c.label].step for c in group}
             # Without the model, which may be damaged or deleted, captures that are rendered get another crop.
             if "estimate" in steps or ("render" in steps and used and model is None):
                 model = self._model(group, path, files, learn, record)
             yield group, model
 
     def _renderings(
-        self, flights: Iterable[Flight], plan: "_Plan"
+        self, flights: Sequence[Flight], left: dict[str, Remaining]
     ) -> Iterator[tuple[Capture, Path | None, RenderOptions]]:
-        """Yield each capture with the model of its flight and how it is rendered; with another crop, it is again."""
-        flights = list(flights)
-        grids = grids_of_cameras(flights, plan.grids, self.settings.write, self.out)
+        """Yield each capture with the model of its flight and how it is rendered; with another crop, it is again, which
+        is noted in `left`.
+        """
+        kept = {label: one.grid for label, one in left.items() if one.grid is not None}
+        grids = grids_of_cameras(flights, kept, self.settings.write, self.out)
         for group, model in flights:
             for capture in group:
                 common, fine = grids[crop_key(capture)]
-                is_finished = plan.left[capture.label].step == "nothing"
-                if is_finished and common is not None and plan.grids.get(capture.label) not in (None, common):
-                    plan.left[capture.label] = Remaining("render", ("crop of the flight",))
+                is_finished = left[capture.label].step == "nothing"
+                if is_finished and common is not None and kept.get(capture.label, common) != common:
+                    left[capture.label] = Remaining("render", ("crop of the flight",))
                 yield capture, model, RenderOptions(len(self.flight.captures), common, fine)
 
     def _kept(self, capture: Capture, left: Remaining) -> CaptureReport:
@@ -402,15 +380,6 @@ class _FlightRun:
                 return replace(report, impossible_products=impossible)
         why = left.why_kept or f"{path}: was changed during the run; the same command estimates the capture again"
         return CaptureReport(capture.label, "error", error=why, why_kept=left.why_kept)
-
-    def _earlier_grid(self, left: Remaining) -> OutputGrid | None:
-        """Return the grid of the rasters of an earlier result if this run makes the same; None without any."""
-        if left.earlier is None or left.earlier.output is None:
-            return None
-        before = left.earlier.write_options
-        now = self.settings.write.model_dump(mode="json", exclude_defaults=True)
-        is_same = all(before.get(name) == now.get(name) for name in ("crop", "resolution", "undistort"))
-        return left.earlier.output.grid if is_same else None
 
     def _model(
         self,
