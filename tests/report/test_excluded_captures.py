@@ -209,14 +209,16 @@ def test_a_reflectance_is_used_or_refused(between_panels: Path, tmp_path: Path) 
         "Red edge": 0.25
     }
 
-    def aligned(given: str) -> None:
-        write = WriteSettings(radiometry="panel", panel_albedo=albedos(given))
+    def aligned(given: str | tuple[tuple[str, float], ...]) -> None:
+        of_bands = albedos(given) if isinstance(given, str) else given
+        write = WriteSettings(radiometry="panel", panel_albedo=of_bands)
         agalign.align_folder(between_panels, tmp_path, settings=agalign.Settings(write=write))
 
     for given, said in (
         ("0.5,Bleu=0.49", r"no band 'bleu', as --panel-albedo asks \(did you mean 'Blue'\?\)"),
         ("0.51,0.49", "has two reflectances of all bands"),
         ("RedEdge=0.5,red edge=0.4", "has two reflectances of red edge"),
+        ((("rededge", 0.5), ("red edge", 0.4)), "has two reflectances of red edge"),
     ):
         with pytest.raises(ConfigurationError, match=said):
             aligned(given)
