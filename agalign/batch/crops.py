@@ -18,30 +18,25 @@ from agalign.values.image import OutputGrid
 
 Flight = tuple[list[Capture], Path | None]
 """Captures of a flight, and the file of its model."""
-_CropKey = tuple[str, bool]
 
 
-def crop_key(capture: Capture) -> _CropKey:
-    """Return the camera, and whether its reference can be undistorted: captures with the same key share a grid."""
-    return camera_key(capture), capture.reference.lens is None
-
-
-def grids_of_cameras(
+def grids_of_captures(
     flights: Sequence[Flight], kept: Mapping[str, OutputGrid], settings: WriteSettings, out: Path
-) -> dict[_CropKey, tuple[OutputGrid | None, OutputGrid | None]]:
-    """Return the grid of the stacks and that of the pan-sharpened files, by `crop_key`; None if each capture has its
-    own. `kept` has the grids of earlier results by label.
+) -> dict[str, tuple[OutputGrid | None, OutputGrid | None]]:
+    """Return the grids that a capture shares with those of its camera, by label: that of the stacks, and that of the
+    pan-sharpened files; None if it has its own. `kept` has the grids of earlier results by label.
     """
-    limits, by_key = limits_of_cameras(flights), dict[_CropKey, list[Capture]]()
+    limits, sharing = limits_of_cameras(flights), dict[tuple[str, bool], list[Capture]]()
     for capture in (c for captures, _ in flights for c in captures):
-        by_key.setdefault(crop_key(capture), []).append(capture)
-    result = {}
-    for key, captures in by_key.items():
-        common = _common_grid(captures, kept, settings, limits[key[0]])
+        # Captures without a lens model are not undistorted.
+        sharing.setdefault((camera_key(capture), capture.reference.lens is None), []).append(capture)
+    result: dict[str, tuple[OutputGrid | None, OutputGrid | None]] = {}
+    for (camera, _), captures in sharing.items():
+        common = _common_grid(captures, kept, settings, limits[camera])
         fine = common
         if common is not None and settings.resolution != "finest":
-            fine = _fine_grid(captures, kept, common, limits[key[0]], out)
-        result[key] = common, fine
+            fine = _fine_grid(captures, kept, common, limits[camera], out)
+        result |= dict.fromkeys((c.label for c in captures), (common, fine))
     return result
 
 

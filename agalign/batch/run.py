@@ -12,7 +12,7 @@ from typing import Self
 from agalign.batch import earlier_results, output_files
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
-from agalign.batch.crops import Flight, crop_key, grids_of_cameras
+from agalign.batch.crops import Flight, grids_of_captures
 from agalign.batch.earlier_results import EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.model_files import ModelFiles
@@ -360,10 +360,10 @@ class _FlightRun:
         is noted in `left`.
         """
         kept = {label: one.grid for label, one in left.items() if one.grid is not None}
-        grids = grids_of_cameras(flights, kept, self.settings.write, self.out)
+        grids = grids_of_captures(flights, kept, self.settings.write, self.out)
         for group, model in flights:
             for capture in group:
-                common, fine = grids[crop_key(capture)]
+                common, fine = grids[capture.label]
                 is_finished = left[capture.label].step == "nothing"
                 if is_finished and common is not None and kept.get(capture.label, common) != common:
                     left[capture.label] = Remaining("render", ("crop of the flight",))
