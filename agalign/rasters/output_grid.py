@@ -102,8 +102,12 @@ def output_layers(
 def _frame(reference: Band, mappings: Iterable[PixelMapping], settings: WriteSettings) -> OutputGrid:
     """The pixel grid of the output before the crop: that of the reference, a finer one, or one without distortion."""
     scale = _finest_scale(mappings, reference) if settings.resolution == "finest" else 1.0
+    return _frame_of_scale(reference, scale, undistorted=settings.undistort and reference.lens is not None)
+
+
+def _frame_of_scale(reference: Band, scale: float, *, undistorted: bool) -> OutputGrid:
+    """The pixel grid of the output before the crop, with a whole number of pixels."""
     size_px = round(reference.width_px * scale), round(reference.height_px * scale)
-    undistorted = settings.undistort and reference.lens is not None
     return OutputGrid(0, 0, *size_px, PixelScale.between(reference.size_px, size_px), undistorted)
 
 
@@ -143,13 +147,13 @@ def at_finest_scale(
     mappings = [mapping for mapping, _ in _mappings_of_flight(reference, limits)]
     if scale is None and not mappings:
         return None
-    frame_px = np.multiply(reference.size_px, _finest_scale(mappings, reference) if scale is None else scale)
-    fine = PixelScale.between(reference.size_px, (round(float(frame_px[0])), round(float(frame_px[1]))))
-    factor, decimals = fine.over(common.scale), 6
+    scale = scale or _finest_scale(mappings, reference)
+    frame = _frame_of_scale(reference, scale, undistorted=common.undistorted)
+    factor, decimals = frame.scale.over(common.scale), 6
     left, top = (math.ceil(round(v, decimals)) for v in np.multiply((common.x0, common.y0), factor).tolist())
     ends = common.x0 + common.width, common.y0 + common.height
     right, bottom = (math.floor(round(v, decimals)) for v in np.multiply(ends, factor).tolist())
-    return OutputGrid(left, top, right - left, bottom - top, fine, common.undistorted)
+    return replace(frame, x0=left, y0=top, width=right - left, height=bottom - top)
 
 
 def _mappings_of_flight(reference: Band, limits: FlightLimits) -> list[tuple[PixelMapping, Band]]:
