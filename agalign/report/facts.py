@@ -26,7 +26,8 @@ from agalign.report.page_data import DataParts
 from agalign.report.pair_totals import CautionGroup, PairTotals
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
 from agalign.spectral_indices.formulas import index_named
-from agalign.spectral_indices.rasters import PICTURE_PX, IndexReport, reason_not_written
+from agalign.spectral_indices.picture import PICTURE_PX
+from agalign.spectral_indices.rasters import IndexReport, reason_not_written
 from agalign.values.alignment import Prediction
 from agalign.values.remedies import NO_RESULT
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,34 +21,28 @@ from agalign.flight.fingerprint import hashed
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
-from agalign.pixels.raster import OpenRaster, open_raster
+from agalign.pixels.raster import OpenRaster
 from agalign.rasters import geotiff
 from agalign.rasters.aligned_files import tags_of
 from agalign.rasters.band_reader import RAW, UNSTATED, BandReader
-from agalign.rasters.drawing import with_text, write_png
 from agalign.rasters.product import CapturePaths, LostFile, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand, bands_of, quality_layers
 from agalign.records.listed_files import ListedFiles
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.before_alignment import index_before
 from agalign.spectral_indices.formulas import Index, bands_for, chosen_indices, compute, index_named, index_of_formula
+from agalign.spectral_indices.picture import write_picture
 from agalign.values.capture import Band, Capture
 from agalign.values.fields import equal
-from agalign.values.image import Tile, reduced_size_px
+from agalign.values.image import Tile
 from agalign.values.radiometry import are_raw_numbers
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
 
-PICTURE_PX = 720
-"""Longer side of the image at the top left of a picture, which the report overlays on the composite."""
 _OF_CAPTURE = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME"
 _SAMPLES_TAG = "INPUT_SAMPLES"
 """Tags of a raster that tell of which capture it is."""
 _STATISTICS_TAG = "INDEX_STATISTICS"
-_COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
-"""Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
-_NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
-"""Greys for raw numbers, whose values do not distinguish soil and vegetation."""
 
 
 @dataclass(frozen=True)
@@ -497,7 +490,7 @@ def _write(
         shares = (pixels / (like.width * like.height) for pixels in (valid_px, masked_px))
         statistics = _statistics(index, unit, sample, *shares)
         dataset.update_tags(**{_STATISTICS_TAG: json.dumps(statistics.as_json())})
-    _draw(index, target, sample, statistics)
+    write_picture(index.name, target, sample, (statistics.low, statistics.high), is_raw=statistics.unit == RAW)
     return statistics
 
 
@@ -531,43 +524,3 @@ def _statistics(
         low, high = index.span
     # The ends of the colour scale must differ.
     return IndexStatistics(median, p5, p95, valid_share, unit, low, max(high, low + 1e-3), masked_share)
-
-
-def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:
-    """Write the picture of a raster, and the histogram of a sample of its values in the same colours.
-
-    Raw numbers are drawn in greys. Raises OutputError.
-    """
-    with open_raster(raster) as dataset:
-        size_px = dataset.width, dataset.height
-        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / PICTURE_PX))[::-1])
-    span, ramp = (statistics.low, statistics.high), _NEUTRAL if statistics.unit == RAW else _COLOURS
-    shape = values.shape
-    width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
-    # In float64: a value clipped in float32 may be just outside the span.
-    counts = np.histogram(sample.astype(float).clip(*span), bins, span)[0]
-    sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
-    sheet[: shape[0], : shape[1]] = _coloured(values, span, ramp)
-    base = shape[0] + margin + bars
-    edges = np.linspace(margin, width - margin, bins + 1).round().astype(int)
-    centres = np.linspace(*span, 2 * bins + 1, dtype=np.float32)[1::2]
-    colours = _coloured(centres[None], span, ramp)[0]
-    # The first and last bins also contain the values beyond the span.
-    heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
-    for left, right, height, colour in zip(edges, edges[1:], heights.tolist(), colours.tolist(), strict=False):
-        cv2.rectangle(sheet, (int(left), base - height), (int(right) - 1, base), colour, -1)
-    for value in np.linspace(*span, 5):
-        at = round(margin + (value - span[0]) / (span[1] - span[0]) * (width - 2 * margin))
-        sheet = with_text(sheet, f"{value:.3g}" if abs(value) >= 100 else f"{value:.2f}", (at, base + 18), anchor="ms")
-    note = ": raw numbers, not reflectance" if statistics.unit == RAW else ""
-    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
-    write_png(with_text(sheet, title, (margin, shape[0] + 18), 16), raster.with_suffix(".png"))
-
-
-def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Values (height, width) as colours (height, width, 3)."""
-    share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
-    stops = np.linspace(0, 1, len(ramp))
-    result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
-    result[~np.isfinite(values)] = (225, 190, 215)
-    return np.asarray(result.round(), np.uint8)

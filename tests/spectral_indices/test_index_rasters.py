@@ -28,16 +28,9 @@ from agalign.records.sidecar_file import add_products, read_sidecar, verify_outp
 from agalign.report.pages import write_pages
 from agalign.spectral_indices import rasters
 from agalign.spectral_indices.before_alignment import index_before
-from agalign.spectral_indices.formulas import (
-    INDICES,
-    Index,
-    bands_for,
-    compute,
-    evaluate,
-    index_named,
-    index_of_formula,
-)
+from agalign.spectral_indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
 from agalign.spectral_indices.indices_csv import current_rows, update_table
+from agalign.spectral_indices.picture import write_picture
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
@@ -564,14 +557,13 @@ def test_an_index_that_cannot_be_written_does_not_cost_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_aligned(tmp_path, 1)
-    draw = rasters._draw
 
-    def draw_but_ndre(index: Index, *arguments: Any) -> None:
-        if index.name == "ndre":
+    def write_but_ndre(index: str, *arguments: Any, **options: Any) -> None:
+        if index == "ndre":
             raise OutputError("the disk is full")
-        draw(index, *arguments)
+        write_picture(index, *arguments, **options)
 
-    monkeypatch.setattr(rasters, "_draw", draw_but_ndre)
+    monkeypatch.setattr(rasters, "write_picture", write_but_ndre)
     written, unwritten, last = indices_of(tmp_path, "ndvi", "ndre", "gndvi")
     assert unwritten.problem == "the disk is full"
     listed = [part.file for part in read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products]
