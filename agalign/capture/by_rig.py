@@ -126,9 +126,9 @@ def observation(
 
 
 def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
-    """Return the aligned mappings of a capture as an observation of the rig."""
+    """Return the aligned mappings of a capture as an observation of the rig, without what they contain of it."""
     known = {
-        name: replace(a.joint, fixed_to_moving=a.fixed_to_moving)
+        name: a.joint.by_images or replace(a.joint, fixed_to_moving=a.fixed_to_moving)
         for name, a in result.items()
         if a.status == "aligned" and a.joint is not None
     }

@@ -122,7 +122,8 @@ def _with_prior(pair: BandPair, result: JointResult, prior: RigPrediction) -> Jo
     of_rig = whitening[None], (whitening @ delta_px)[None], weight
     estimate = least_squares(*of_rig, of_images, robust=robust, first_weights=first_weight)
     # Rounding removes the last bits, which depend on the machine's order of summation.
-    return _displaced(pair, result, np.round(estimate.mean, 6), np.round(estimate.covariance, 12))
+    combined = _displaced(pair, result, np.round(estimate.mean, 6), np.round(estimate.covariance, 12))
+    return replace(combined, by_images=result)
 
 
 def _displaced(

@@ -59,7 +59,8 @@ def learn_rig(
     if not bands:
         return None
     table = _Table(captures, bands, size_px, layout)
-    factors, errors_px = table.selected_factors(apply)
+    factors, compared_px = table.selected_factors(apply)
+    errors_px = table.of_predictions_px(compared_px)
     fitted, nu_w = table.fit(np.ones(len(captures)), factors)
     t_std = table.baseline_std(nu_w, errors_px)
     offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), zip(bands, fitted[:, 6:8].tolist(), strict=True)
@@ -163,6 +164,16 @@ class _Table:
             if np.abs(bands - previous).max() < max_change:
                 break
         return bands, result
+
+    def of_predictions_px(self, compared_px: Array) -> Array:
+        """Return (bands,) the errors of predictions from their distances to mappings, which have errors of their own.
+
+        These are known to a factor: at least half of the distance is kept.
+        """
+        is_known = self.weights > 0
+        own_px2 = np.where(is_known, 2 / np.maximum(self.weights, 1e-12) - rig.MIN_STD_PX**2, 0.0)
+        mean_own_px2 = own_px2.sum(axis=0) / is_known.sum(axis=0)
+        return np.asarray(np.sqrt(np.maximum(compared_px**2 - mean_own_px2, compared_px**2 / 4)))
 
     @property
     def _t_std(self) -> float:

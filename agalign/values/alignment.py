@@ -120,6 +120,9 @@ class JointResult:
     corner_covariance_px2: Annotated[NDArray[np.float64] | None, Field(exclude=True)] = None
     """Covariance of the corners of a homography, also if a simpler family was fitted; a sidecar has that of the
     mapping, in `error`."""
+    by_images: Annotated["JointResult | None", Field(exclude=True)] = None
+    """The estimate without the rig, if this one contains the rig: with it, other bands are predicted. A sidecar does
+    not have it."""
 
     @property
     def corner_std_px(self) -> float:
@@ -144,10 +147,14 @@ class JointResult:
         return np.diag(np.square(np.ravel(self.corner_std_xy_px)))
 
     def with_homography(self, fixed_to_moving: Matrix, covariance_px2: NDArray[np.float64]) -> "JointResult":
-        """Return the result with another homography and covariance (8, 8) of the corners."""
+        """Return the result of images with another homography and covariance (8, 8) of the corners."""
         std = tuple((float(x), float(y)) for x, y in np.sqrt(np.diag(covariance_px2)).reshape(4, 2))
         return replace(
-            self, fixed_to_moving=fixed_to_moving, corner_covariance_px2=covariance_px2, corner_std_xy_px=std
+            self,
+            fixed_to_moving=fixed_to_moving,
+            corner_covariance_px2=covariance_px2,
+            corner_std_xy_px=std,
+            by_images=None,
         )
 
     def in_file_px(self, scales: PairScales) -> "JointResult":
@@ -160,6 +167,7 @@ class JointResult:
             last_step_px=self.last_step_px * up.mean,
             corner_std_xy_px=tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px),
             corner_covariance_px2=None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis,
+            by_images=None,
         )
 
 

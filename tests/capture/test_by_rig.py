@@ -19,6 +19,7 @@ from agalign.cameras.discover import discover
 from agalign.capture.align_bands import CaptureEstimation, align_capture_bands, bands_to_learn
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import UnderRelief
+from agalign.capture.by_rig import observed
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
@@ -230,6 +231,18 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
     assert bands_to_learn(in_relief, {**replaced, "NIR": of_chance}, model.rig, first.capture) == set()
 
 
+def test_bands_are_predicted_from_others_without_what_these_contain_of_the_rig(first: Estimated) -> None:
+    """Else the images of a band would predict the band itself, by the rig and the other bands."""
+    result = first.estimation.decided()
+    nir = result["NIR"]
+    moved = geometry.compose(geometry.translation(0.5, 0.0), nir.fixed_to_moving)
+    by_images = replace(nir.joint, fixed_to_moving=moved, by_images=None)
+    with_rig = {**result, "NIR": replace(nir, joint=replace(nir.joint, by_images=by_images))}
+    known = observed(first.pairs, with_rig, first.capture)
+    scales = first.estimation.bands["NIR"].pair.scales
+    np.testing.assert_allclose(known.mappings["NIR"], scales.between_files(moved))
+
+
 @pytest.mark.parametrize("off_px", [8.0, 25.0])
 def test_of_two_bands_that_contradict_each_other_neither_is_accurate(first: Estimated, off_px: float) -> None:
     """A shift along the baselines is that of a nearer scene, too: nothing decides which of them is wrong."""
@@ -238,7 +251,8 @@ def test_of_two_bands_that_contradict_each_other_neither_is_accurate(first: Esti
     matrix = geometry.compose(geometry.translation(x, y), nir.fixed_to_moving)
     mapping = replace(nir.mapping, fixed_to_moving=matrix).without_parallax
     pair = first.estimation.bands["NIR"].pair
-    shifted = Candidate(pair, mapping, nir.error, nir.residual, nir.joint, given_issues=())
+    joint = replace(nir.joint, by_images=None)
+    shifted = Candidate(pair, mapping, nir.error, nir.residual, joint, given_issues=())
     for alignment in first.with_nir(shifted).predicted().values():
         assert (alignment.status, alignment.issues[0].code) == ("predicted", "unexpected_px")
         assert alignment.prediction.std_px > 3.0

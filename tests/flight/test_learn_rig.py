@@ -156,6 +156,27 @@ def test_the_standard_error_of_a_baseline_contains_what_the_model_does_not_expla
 
 
 @pytest.mark.slow
+def test_the_error_of_predictions_is_without_that_of_the_mappings_they_are_compared_with() -> None:
+    """Noisy captures: the mean of many others is more accurate than any of them."""
+    rng, noise_px = np.random.default_rng(2), 0.4
+
+    def noisy(seed: int, nu: float) -> Observation:
+        capture = observation(10.0 * seed, nu, noise=noise_px, seed=seed)
+        return replace(capture, std_px=dict.fromkeys(capture.mappings, noise_px * 2**0.5))
+
+    rig = learn_rig([noisy(k, rng.normal(0, 5)) for k in range(24)], SIZE, {})
+    errors_px, claims_px = [], []
+    for seed, nu in enumerate(rng.normal(0, 5, 20), start=100):
+        known = noisy(seed, nu)
+        known = replace(known, mappings={b: m for b, m in known.mappings.items() if b != "Red edge"})
+        predicted = predict_band(rig, "Red edge", known)
+        errors_px.append(distance_px(predicted.fixed_to_moving, mappings(nu)["Red edge"], SIZE))
+        claims_px.append(predicted.std_px)
+    rms_px, claimed_px = (float(np.sqrt(np.mean(np.square(values)))) for values in (errors_px, claims_px))
+    assert 0.45 * claimed_px < rms_px < 1.2 * claimed_px
+
+
+@pytest.mark.slow
 def test_a_capture_without_bands_is_interpolated_between_its_neighbours() -> None:
     """The drone descends steadily: interpolation is more accurate than the flight's mean."""
     rig = learn_rig([observation(10.0 * k, 0.5 * k) for k in range(9)], SIZE, {})
