@@ -134,8 +134,11 @@ def _covariances(normal: Tensor, score: Tensor, cell: Tensor) -> Tensor:
     """Return two sandwich covariances of the parameters, (2, P, P), from the scores (N, P) of the patches.
 
     The first treats patches as independent. The second is clustered by the cell (N,) of the image (Liang & Zeger 1986),
-    because overlapping patches share pixels; with few cells it may underestimate the variance.
+    because overlapping patches share pixels; with few cells it may underestimate the variance. Each patch has two
+    coordinates, of which the parameters take their number (MacKinnon & White 1985, HC1).
     """
+    patches, parameters = score.shape
+    of_few = patches / max(patches - parameters / 2, 1.0)
     of_cells = score.new_zeros((int(cell.max()) + 1, score.shape[1])).index_add_(0, cell, score)
     inverse = torch.linalg.inv(normal)
-    return torch.stack([inverse @ (s.T @ s) @ inverse for s in (score, of_cells)])
+    return of_few * torch.stack([inverse @ (s.T @ s) @ inverse for s in (score, of_cells)])
