@@ -19,6 +19,9 @@ from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
+_LONGEST_SIDE_PX = 512
+"""Larger images are reduced to this: each point of a surface is the training of a network."""
+
 
 def loss_surface(
     fixed: Raster,
@@ -32,9 +35,9 @@ def loss_surface(
     """Return the mean loss per keypoint after training with psi fixed at the truth shifted by each (x, y): (n, n).
 
     Rows are along y; nan if too few keypoints remain. Each network is trained from the same random weights by recipe
-    paper, at the resolution with a longer side of at most 512 px. Offsets are px of the full resolution.
+    paper, on images reduced to _LONGEST_SIDE_PX. Offsets are px of the full resolution.
     """
-    scale = min(1.0, 512 / max(fixed.size_px))
+    scale = min(1.0, _LONGEST_SIDE_PX / max(fixed.size_px))
     result = np.full((len(offsets_px), len(offsets_px)), np.nan)
     for row, dy in enumerate(offsets_px):
         for column, dx in enumerate(offsets_px):
