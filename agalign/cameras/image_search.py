@@ -9,7 +9,8 @@ from pathlib import Path
 
 from agalign.cameras.image_file import Problem, natural_order, problem_of
 from agalign.errors import InputError
-from agalign.host.files import REPORT_FILE, RUN_FILE, SUMMARY_FILE, path_problem
+from agalign.host.files import PAGE_STARTS, REPORT_FILE, RUN_FILE, SUMMARY_FILE, path_problem
+from agalign.host.own_files import has_mark
 from agalign.host.text import counted
 from agalign.pixels.raster import suffix_format
 
@@ -129,7 +130,8 @@ def _is_input_folder(folder: Path, skipped: set[Path], outputs: list[Path]) -> b
     """False for hidden folders, those of operating systems on memory cards, and the output folder of a run, which is
     added to `outputs`.
 
-    A run writes RUN_FILE first, so the output of a killed run is recognised too.
+    A run writes RUN_FILE first, so the output of a killed run is recognised too; pages of that name of other programs
+    are no output.
     """
     of_system = "lost+found", "System Volume Information", "$RECYCLE.BIN"
     if folder.name.startswith(".") or folder.name in of_system or folder.resolve() in skipped:
@@ -138,6 +140,7 @@ def _is_input_folder(folder: Path, skipped: set[Path], outputs: list[Path]) -> b
         entries = {entry.name for entry in os.scandir(folder)}
     except OSError:
         return True
-    is_output = RUN_FILE in entries or {SUMMARY_FILE, REPORT_FILE} <= entries
+    pages = [name in entries and has_mark(folder / name, (PAGE_STARTS[name],)) for name in (SUMMARY_FILE, REPORT_FILE)]
+    is_output = RUN_FILE in entries or all(pages)
     outputs += [folder] if is_output else []
     return not is_output

@@ -16,6 +16,7 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
 from agalign.flight.groups import camera_overviews
+from agalign.host.files import PAGE_STARTS, REPORT_FILE, SUMMARY_FILE
 from agalign.values.capture import Band, CameraIdentity, Capture, Position
 
 from ..conftest import write_band
@@ -285,8 +286,11 @@ def test_output_folders_are_not_looked_into(images: Path) -> None:
     write(images / "out" / "x.tif", bands=2)
     assert "out/x" in found(images)
     assert "out/x" not in found(images, skip=(images / "out",))
-    for name in ("summary.csv", "index.html"):
-        (images / "out" / name).touch()
+    for name in (SUMMARY_FILE, REPORT_FILE):
+        (images / "out" / name).write_text("pages of another program")
+    assert "out/x" in found(images)
+    for name in (SUMMARY_FILE, REPORT_FILE):
+        (images / "out" / name).write_bytes(PAGE_STARTS[name])
     assert "out/x" not in found(images)
 
 
