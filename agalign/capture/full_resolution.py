@@ -137,10 +137,9 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual:
             warped = resample_tile(moving, mapping, tile, "lanczos", read=partial(read_tile, dataset=source))
             part = windows.residuals(_raster(*warped, moving))
             # The windows of neighbouring tiles are adjacent, as a misaligned area may be in several.
-            first = np.array(cell) * (np.array([tile.width, tile.height]) // windows.side)
-            parts.append(
-                replace(part, centres_px=part.centres_px + np.array([tile.x0, tile.y0]), cells=part.cells + first)
-            )
+            centres_px = part.centres_px + np.array([tile.x0, tile.y0])
+            cells = part.cells + np.array(cell) * (np.array([tile.width, tile.height]) // windows.side)
+            parts.append(replace(part, centres_px=centres_px, cells=cells))
     return Residual.joined(parts)
 
 

@@ -115,9 +115,8 @@ def _with_prior(pair: BandPair, result: JointResult, prior: RigPrediction) -> Jo
     degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
     robust = Robust(degrees_of_freedom**0.5, iterations=20)
     first_weight = np.ones(1)  # that of a residual of 0 would start at the rig and may stay there
-    weight = (
-        1 + CORNERS / degrees_of_freedom
-    ) * first_weight  # of a multivariate t distribution: (nu + 8) / (nu + r^2)
+    # Of a multivariate t distribution: (nu + 8) / (nu + r^2).
+    weight = (1 + CORNERS / degrees_of_freedom) * first_weight
     of_images = np.asarray(np.linalg.inv(result.corner_covariance_px2), np.float64)
     of_rig = whitening[None], (whitening @ delta_px)[None], weight
     estimate = least_squares(*of_rig, of_images, robust=robust, first_weights=first_weight)

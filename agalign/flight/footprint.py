@@ -131,7 +131,7 @@ def accuracy_of_footprint_m(capture: Capture) -> float | None:
     distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
     tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
     position_std_m = 3.0  # of a GPS receiver without corrections
-    heading_std = math.radians(5.0)  # of a magnetic compass
+    heading_std = math.radians(5.0)  # of a magnetic heading
     # By a gimbal or attitude sensor; of a camera that is fixed to an aircraft.
     tilt_std = math.radians(2.0 if pose.pitch_deg or pose.roll_deg else 7.0)
     # Of an assumed height; of a barometric height over uneven ground.

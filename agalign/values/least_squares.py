@@ -103,7 +103,7 @@ def cauchy_weights(residuals: ArrayLike, scale: float | Array) -> Array:
 
 def mean_in_standard_errors(values: Array) -> float:
     """Return the mean of values (n,) relative to its standard error; 0 for few values, whose spread is unknown."""
-    min_values = 10  # noise exceeds four of these standard errors in 0.3 % of the cases, and in 4 % with four values
+    min_values = 10  # noise exceeds four of these standard errors in 0.3 % of the cases, and in 3 % with four values
     if len(values) < min_values:
         return 0.0
     return float(values.mean() / max(values.std(ddof=1) / math.sqrt(len(values)), 1e-12))
