@@ -94,11 +94,6 @@ class WindowFit:
         """Maximum displacement of a corner along x or y."""
         return float(np.abs(self.corners_px).max())
 
-    @property
-    def scale_px(self) -> float:
-        """Robust scale of the residuals, `shift_scale_px`."""
-        return shift_scale_px(self.residuals_px[np.isfinite(self.residuals_px)])
-
     def applied_to(self, mapping: PixelMapping) -> PixelMapping:
         """Correct a homography; lens shapes and baseline replace those of the mapping. Raises GeometryError."""
         corners = geometry.moving_corners(self.corners_px, *self.size_px)
@@ -123,12 +118,14 @@ def fit_windows(
     lens_std_px: Array | None = None,
     *,
     baseline: BaselinePrior | None = None,
+    start: PixelMapping | None = None,
 ) -> WindowFit | None:
     """Fit the correction of a mapping of a reference (width, height) to the residual measured with this mapping.
 
-    With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too; with the prior of its
-    `baseline`, also that along which the band sees the relief of the mapping. Without lens shapes, the result is None
-    if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
+    With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too, and the homography has a
+    prior around that of `start`, by default of the mapping itself. With the prior of its `baseline`, that along which
+    the band sees the relief of the mapping is fitted too. Without lens shapes, the result is None if fewer than 12
+    windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
     raw = Shifts.of(residual)
     if lens_std_px is None and len(raw.centres_px) < _MIN_FITTED_WINDOWS:
@@ -140,6 +137,10 @@ def fit_windows(
     count = len(std_px)
     design = jacobian(points_px, size_px, count)
     mean = np.zeros(count)
+    if start is not None:
+        to_start = geometry.compose(geometry.invert(mapping.fixed_to_moving), start.fixed_to_moving)
+        at_corners = geometry.corners(*size_px)
+        mean[:CORNERS] = (geometry.apply(to_start, at_corners) - at_corners).ravel()
     if baseline is not None and mapping.parallax is not None:
         parallax_px = mapping.parallax.relief(raw.centres_px)
         shifts_px = shifts_px + parallax_px[:, None] * np.array(mapping.parallax.baseline)
@@ -186,16 +187,16 @@ def fit_in_rounds(
     together move a corner by more than `max_moved_px`, px of the reference. Lens shapes are always fitted to a
     mapping with the given displacement field, and replace it in the result.
     """
-    to_start, result = geometry.invert(mapping.fixed_to_moving), None
+    start, result = mapping, None
     for _ in range(rounds):
-        fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, baseline=baseline)
+        fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, baseline=baseline, start=start)
         if fit is None or not is_accepted(fit):
             return None
         try:
             result = fit.applied_to(mapping), fit
         except GeometryError:
             return None
-        moved = geometry.compose(to_start, result[0].fixed_to_moving)
+        moved = geometry.compose(geometry.invert(start.fixed_to_moving), result[0].fixed_to_moving)
         if not geometry.corner_error_px(moved, geometry.identity(), *size_px) <= max_moved_px:
             return None
         converged_px, change_px = 0.02, fit.max_px  # noise of the windows
@@ -247,7 +248,8 @@ def cross_fitted(
         return None
     last, residual = measured[-1]
     folds = folds_of(residual)
-    fits = [fit_windows(last, part, size_px, lens_std_px) for part in remaining(residual, folds, side_px)]
+    parts = remaining(residual, folds, side_px)
+    fits = [fit_windows(last, part, size_px, lens_std_px, start=mapping) for part in parts]
     try:
         by_fold = [fit.applied_to(last) for fit in fits if fit is not None]
     except GeometryError:  # the windows are degenerate without a fold
@@ -333,16 +335,13 @@ class Adjustment:
     """Of each band; the longest baseline has length 1."""
     parallax_px: Array
     """(n,) parallax of the windows."""
+    scales_px: Array
+    """(bands,) robust scales of the residuals, `shift_scale_px`."""
 
     @property
     def baselines(self) -> Array:
         """(bands, 2) t_b."""
         return np.array([fit.baseline for fit in self.fits])
-
-    @property
-    def scales_px(self) -> Array:
-        """(bands,) robust scales of the residuals, `shift_scale_px`."""
-        return np.array([fit.scale_px for fit in self.fits])
 
 
 def adjust(
@@ -385,7 +384,8 @@ def adjust(
     if (parallax.mean() if layout is None else np.sum(baselines * layout)) < 0:
         baselines, parallax = -baselines, -parallax
     of_bands = zip(np.hstack([smooth, baselines]), residuals, by_band.covariance, strict=True)
-    return Adjustment([_window_fit(mean, r, size_px, covariance, count) for mean, r, covariance in of_bands], parallax)
+    fits = [_window_fit(mean, r, size_px, covariance, count) for mean, r, covariance in of_bands]
+    return Adjustment(fits, parallax, scales)
 
 
 def are_of_lenses(baselines: Array, layout: Array | None) -> bool:

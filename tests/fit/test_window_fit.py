@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from agalign.fit.held_out import chessboard, one_by_one
-from agalign.fit.window_fit import WindowFit, cross_fitted, fit_windows
+from agalign.fit.window_fit import WindowFit, cross_fitted, fit_in_rounds, fit_windows
 from agalign.fit.windows import residual_under
 from agalign.values import geometry
+from agalign.values.least_squares import shift_scale_px
 from agalign.values.lens_shapes import CALIBRATED, LENS_STD, jacobian, lens_shapes, lens_std_px, variance_px2
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.residual import Residual
@@ -141,6 +142,18 @@ def test_the_limit_of_a_correction_is_for_all_rounds_together(magnification: flo
     assert cross_fitted(start, measure, SIZE, chessboard, 112, max_moved_px=5.0) is None
 
 
+def test_the_prior_of_a_correction_is_around_the_first_mapping_in_all_rounds() -> None:
+    """Four windows determine little beyond the prior: more rounds do not lead away from it."""
+    of_start, stds_px = windows(np.full(8, 3.0), CENTRES[:4], noise_px=2.0), lens_std_px(SIZE, calibrated=False)
+
+    def corners_px(rounds: int) -> np.ndarray:
+        measure = partial(residual_under, of_start, IDENTITY)
+        mapping, _ = fit_in_rounds(IDENTITY, measure, SIZE, lens_std_px=stds_px, rounds=rounds)
+        return geometry.apply(mapping.fixed_to_moving, geometry.corners(*SIZE)) - geometry.corners(*SIZE)
+
+    np.testing.assert_allclose(corners_px(4), corners_px(1), atol=0.1)
+
+
 def test_unrelated_windows_do_not_verify_a_fit_to_others() -> None:
     rng, medians = np.random.default_rng(0), []
     for _ in range(20):
@@ -217,7 +230,8 @@ def test_unmodelled_distortion_grows_with_extrapolation_and_shrinks_with_calibra
 
 def std_px(fit: WindowFit, points_px: np.ndarray) -> float:
     """RMS error of a fit over points, with the residual of single windows."""
-    return float(np.hypot(np.sqrt(variance_px2(points_px, fit.covariance_px2, SIZE).mean()), fit.scale_px))
+    of_windows_px = shift_scale_px(fit.residuals_px)
+    return float(np.hypot(np.sqrt(variance_px2(points_px, fit.covariance_px2, SIZE).mean()), of_windows_px))
 
 
 def test_windows_in_one_half_determine_the_lens_in_the_other_half_to_the_stated_error() -> None:
