@@ -28,18 +28,10 @@ from agalign.capture.common_parallax import (
 )
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
+from agalign.fit.adjustment import WindowShifts, adjust, are_of_lenses, are_on_a_line, parallax_of
 from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
-from agalign.fit.window_fit import (
-    BaselinePrior,
-    WindowFit,
-    WindowShifts,
-    adjust,
-    are_of_lenses,
-    are_on_a_line,
-    fit_in_rounds,
-    parallax_of,
-)
+from agalign.fit.window_fit import BaselinePrior, WindowFit, fit_in_rounds
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import BY_WINDOWS, JointResult
 from agalign.values.choices import Geometry, ReliefUse

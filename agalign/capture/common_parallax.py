@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import RefinedBand
 from agalign.errors import GeometryError
+from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
 from agalign.fit.displacement_field import MIN_WINDOWS
-from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line, fit_windows
+from agalign.fit.window_fit import fit_windows
 from agalign.fit.windows import residual_under
 from agalign.values.residual import Residual
 

@@ -34,8 +34,8 @@ from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
+from agalign.fit.adjustment import WindowShifts
 from agalign.fit.displacement_field import DisplacementEstimator, DisplacementResult
-from agalign.fit.window_fit import WindowShifts
 from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded

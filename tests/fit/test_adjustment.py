@@ -5,15 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import (
-    Adjustment,
-    BaselinePrior,
-    WindowShifts,
-    adjust,
-    are_of_lenses,
-    fit_windows,
-    parallax_of,
-)
+from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, parallax_of
+from agalign.fit.window_fit import BaselinePrior, fit_windows
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.lens_shapes import lens_std_px
