@@ -24,7 +24,7 @@ from agalign.flight.fingerprint import (
     input_states,
     render_fingerprint,
 )
-from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.host.text import counted
 from agalign.pixels.raster import read_tile
 from agalign.rasters.product import CapturePaths

@@ -4,11 +4,10 @@ import math
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import suppress
 
 from agalign._version import __version__
 from agalign.host.libraries import library_versions
-from agalign.host.processes import memory_limit_bytes, usable_cores
+from agalign.host.processes import memory_limit_bytes, total_memory_bytes, usable_cores
 
 
 def version_lines() -> Iterator[str]:
@@ -23,9 +22,7 @@ def version_lines() -> Iterator[str]:
 
 
 def _memory() -> str:
-    total_bytes, limit_bytes = math.inf, memory_limit_bytes()
-    with suppress(AttributeError, ValueError, OSError):  # not on Windows
-        total_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    total_bytes, limit_bytes = total_memory_bytes(), memory_limit_bytes()
     total = "unknown" if total_bytes == math.inf else f"{total_bytes / 1e9:.1f} GB"
     return total if limit_bytes >= total_bytes else f"{total}, limited to {limit_bytes / 1e9:.1f} GB"
 

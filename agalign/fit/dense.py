@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.host.memory_limits import MAX_MATCHED_PX
+from agalign.host.held_sizes import MAX_MATCHED_PX
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry, lens

@@ -83,6 +83,13 @@ def _text(path: Path) -> str:
         return ""
 
 
+def total_memory_bytes() -> float:
+    """Return the size of the memory of this machine; inf where it is unknown, as on Windows."""
+    with suppress(AttributeError, ValueError, OSError):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return math.inf
+
+
 def memory_limit_bytes() -> float:
     """Return the smallest limit of the memory of this process's control groups; inf without one. Version 1 has a limit
     above the memory of any machine instead.

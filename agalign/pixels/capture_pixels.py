@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.host.memory_limits import MAX_CAPTURE_BYTES
+from agalign.host.held_sizes import MAX_CAPTURE_BYTES
 from agalign.pixels.raster import read_tile
 from agalign.values.capture import Band
 from agalign.values.image import Mask, Tile

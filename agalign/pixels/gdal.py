@@ -12,7 +12,7 @@ import rasterio
 from rasterio import crs
 from rasterio.errors import NotGeoreferencedWarning
 
-from agalign.host.memory_limits import GDAL_CACHE_BYTES
+from agalign.host.held_sizes import GDAL_CACHE_BYTES
 from agalign.host.text import name_problem
 
 _ENVIRONMENT = {

@@ -19,7 +19,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from agalign.errors import UnreadableFileError
-from agalign.host.memory_limits import MAX_DECODED_PX
+from agalign.host.held_sizes import MAX_DECODED_PX
 from agalign.host.text import name_problem
 from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.gdal import gdal_name, innermost_cause, is_gdal_error, open_local

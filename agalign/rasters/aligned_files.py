@@ -24,7 +24,7 @@ from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.host.files import file_name
-from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.gdal import open_local
 from agalign.pixels.radiometry import calibrated

@@ -10,7 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.cameras.tag_seeds import rig_seed
 from agalign.errors import GeometryError
-from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.pixels.masks import saturated
 from agalign.rasters.geotiff import LayerDescription, compressed
 from agalign.rasters.output_grid import Layer, is_inside

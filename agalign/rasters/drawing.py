@@ -14,7 +14,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from agalign.errors import OutputError, UnreadableFileError
 from agalign.host.files import complete_file
-from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE
 from agalign.pixels.masks import saturated
 from agalign.pixels.raster import ReadTile, read_preview, read_tile

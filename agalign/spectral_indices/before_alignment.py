@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.rasters.aligned_files import layer_pixels
 from agalign.rasters.output_grid import Layer
 from agalign.rasters.product import ProductContext

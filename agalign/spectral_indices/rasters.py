@@ -18,7 +18,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.flight.fingerprint import hashed
-from agalign.host.memory_limits import WORK_TILE_PX
+from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
 from agalign.pixels.raster import OpenRaster

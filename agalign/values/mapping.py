@@ -14,7 +14,7 @@ from pydantic import dataclasses as validated
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates, spline_filter
 
-from agalign.host.memory_limits import MAX_HELD_POSITIONS_PX
+from agalign.host.held_sizes import MAX_HELD_POSITIONS_PX
 from agalign.values import geometry, lens
 from agalign.values.fields import POSITION_DECIMALS, RECORD, Array, Positive
 from agalign.values.geometry import Matrix, Points

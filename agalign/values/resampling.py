@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
-from agalign.host.memory_limits import RESAMPLED_TILE_PX
+from agalign.host.held_sizes import RESAMPLED_TILE_PX
 from agalign.values import geometry
 from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points

@@ -43,7 +43,7 @@ def test_a_library_that_cannot_be_loaded_is_named(monkeypatch: pytest.MonkeyPatc
 )
 def test_the_memory_has_its_limit(monkeypatch: pytest.MonkeyPatch, limit_bytes: float, memory: str) -> None:
     sizes = {"SC_PAGE_SIZE": 4000, "SC_PHYS_PAGES": 2_000_000}
-    monkeypatch.setattr("agalign.cli.version.os.sysconf", sizes.get, raising=False)
+    monkeypatch.setattr("os.sysconf", sizes.get, raising=False)
     monkeypatch.setattr("agalign.cli.version.memory_limit_bytes", lambda: limit_bytes)
     assert memory in version_lines()
 

@@ -1,4 +1,4 @@
-"""Limits of memory: up to which sizes images are held as a whole, and the tiles in which larger ones are processed."""
+"""Sizes that are held in memory at once: of images as a whole, and of the tiles in which larger ones are processed."""
 
 WORK_TILE_PX = 2048
 """Side of the tiles of rasters that are written one after another."""
