@@ -27,8 +27,10 @@ from agalign.values.spectrum import band_key
 R = TypeVar("R")
 Albedos = Mapping[str, float]
 """Reflectance of the panel as the user gives it, by band in lower case; the empty name is the default."""
-MAX_TIME_DIFFERENCE_S = 6 * 3600.0
-"""A panel does not represent the illumination many hours later."""
+MAX_LIGHT_APART_S = 6 * 3600.0
+"""Between a capture and the panels that tell its light, which changes within hours."""
+_MAX_HEIGHT_APART_S = 6 * 3600.0
+"""Between a capture and a panel that tells its height: air pressure changes with the weather, by 1 hPa for 8 m."""
 READERS = 4
 """Number of captures whose images are read at a time: more would wait for the disk."""
 _SAME_LIGHT_S = 3600.0
@@ -88,7 +90,7 @@ class PanelReading:
     """
 
     @property
-    def is_used(self) -> bool:
+    def is_lit(self) -> bool:
         """False for a panel with less than half of the light on a brighter one: shade leaves less, most clouds more."""
         return self.light_ratio >= MIN_LIGHT_RATIO
 
@@ -255,9 +257,9 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
     without one the result is empty. A panel with less than half of the light on another one of the hour is not used.
     """
     of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
-    timed = _within_hours(of_camera, capture)
+    timed = _near_in_time(of_camera, capture, MAX_LIGHT_APART_S)
     near = timed or _without_clock(of_camera, capture)
-    used = [(s, r) for s, r in near if r.is_used]
+    used = [(s, r) for s, r in near if r.is_lit]
     light = _of_panels(used, lambda b: None if b.factor is None else 1 / b.factor)
     scales = _of_panels(used, lambda b: b.sensor_scale)
     suns = {b.name: b.radiometry.by_sun for b in capture.bands if b.radiometry is not None and b.name in light}
@@ -313,7 +315,7 @@ def _contradictions(near: Sequence[PanelReading], band: str) -> list[Radiometric
     dark = [r.light_ratio for r in near if r.brighter]
     bands = [b for r in near for b in r.bands if b.band.name == band]
     albedos = [v for b in bands if b.other_albedo for v in (b.albedo, b.other_albedo) if v]
-    scales = [b.sensor_scale for r in near if r.is_used and not r.fits_sensor for b in r.bands if b in bands]
+    scales = [b.sensor_scale for r in near if r.is_lit and not r.fits_sensor for b in r.bands if b in bands]
     found = [contradiction("two calibration panels", 1.0, min(dark))] if dark else []
     found += [contradiction("reflectance of the panel", *albedos)] if albedos else []
     return found + [contradiction(PANEL_AND_SENSOR, 1.0, scale) for scale in scales[:1] if scale]
@@ -335,7 +337,8 @@ def missing_panel(capture: Capture, readings: Sequence[PanelReading]) -> str:
     if not of_camera:
         other = readings[0].capture
         return f"the panel in {other.label} was photographed by {camera_key(other)}, not by {camera_key(capture)}"
-    if not (near := _within_hours(of_camera, capture) or _without_clock(of_camera, capture)):
+    near = _near_in_time(of_camera, capture, MAX_LIGHT_APART_S) or _without_clock(of_camera, capture)
+    if not near:
         return _far_in_time(capture, of_camera)
     readable = [(r.capture.label, b) for _, r in near for b in r.bands if b.band.name in lacking]
     for label, reading in sorted(readable, key=lambda one: not one[1].problem):
@@ -359,7 +362,7 @@ def _far_in_time(capture: Capture, readings: Sequence[PanelReading]) -> str:
     later_s, nearest = min(later, key=lambda one: abs(one[0]))
     hours = abs(later_s) / 3600
     age = f"{hours / 24:.0f} days" if hours >= 48 else f"{hours:.0f} hours"
-    limit = f"a panel counts for {MAX_TIME_DIFFERENCE_S / 3600:.0f} hours, because the light changes"
+    limit = f"a panel counts for {MAX_LIGHT_APART_S / 3600:.0f} hours, because the light changes"
     return f"the nearest panel, in {nearest.label}, is {age} {'older' if later_s < 0 else 'newer'}; {limit}"
 
 
@@ -372,7 +375,8 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
     pose, here = capture.pose, capture.position
     if pose is None or pose.height_m is not None or capture.altitude_m is None or here is None:
         return capture
-    on_ground = [r.capture for _, r in _within_hours(readings, capture) if r.capture.is_of_a_panel]
+    recent = _near_in_time(readings, capture, _MAX_HEIGHT_APART_S)
+    on_ground = [r.capture for _, r in recent if r.capture.is_of_a_panel]
     near = [c for c in on_ground if c.position is not None and distance_km(c.position, here) <= _MAX_DISTANCE_KM]
     altitudes_m = [c.altitude_m for c in near if c.altitude_m is not None]
     above_panel_m = 1.0  # of the camera when a panel is recorded
@@ -382,11 +386,13 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
     return replace(capture, pose=replace(pose, height_m=height_m, height_from="panel"))
 
 
-def _within_hours(readings: Iterable[PanelReading], capture: Capture) -> list[tuple[float, PanelReading]]:
+def _near_in_time(
+    readings: Iterable[PanelReading], capture: Capture, max_apart_s: float
+) -> list[tuple[float, PanelReading]]:
     """Return (seconds after a capture, reading) of the panels close to it in time; none if its time is unknown."""
     time_s = math.nan if capture.time_s is None else capture.time_s
     timed = [(panel_time_s - time_s, r) for r in readings if (panel_time_s := r.capture.time_s) is not None]
-    return [(later_s, r) for later_s, r in timed if abs(later_s) <= MAX_TIME_DIFFERENCE_S]
+    return [(later_s, r) for later_s, r in timed if abs(later_s) <= max_apart_s]
 
 
 def _without_clock(readings: Sequence[PanelReading], capture: Capture) -> list[tuple[float, PanelReading]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign.errors import InputError
-from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
+from agalign.flight.panel_readings import MAX_LIGHT_APART_S
 from agalign.flight.rig_file import model_fingerprint
 from agalign.host.files import MODELS_FOLDER
 from agalign.records.panels_and_sky import PanelPart, last_panels_and_sky
@@ -164,7 +164,7 @@ class RunFacts:
             panel_time = CaptureTime.of(panel.captured_at)
             # A panel without a time is of the flight.
             apart_s = abs((time.utc - panel_time.utc).total_seconds()) if time and panel_time else 0.0
-            if apart_s > MAX_TIME_DIFFERENCE_S:
+            if apart_s > MAX_LIGHT_APART_S:
                 continue
             for band in panel.bands:
                 if band.sensor_scale:

@@ -39,7 +39,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path, others: Sequence[P
         facts = {"seen_by": panel.seen_by, "serial": panel.serial, "in_scene": panel.in_scene, "cues": panel.cues}
         facts |= {"sensor_scale": float(np.median([*scales.values()])) if scales else None}
         facts |= {"fits_sensor": reading.fits_sensor, "bands": bands}
-        facts |= {"brighter": reading.brighter, "light_ratio": reading.light_ratio, "is_used": reading.is_used}
+        facts |= {"brighter": reading.brighter, "light_ratio": reading.light_ratio, "is_used": reading.is_lit}
         facts |= _identity(reading.capture) | {"picture": picture.relative_to(out).as_posix()}
         parts.append(PanelPart.model_validate(facts))
     write_model(out / PANELS_FILE, PanelsFile(panels=[*others, *parts]) if others or parts else None)

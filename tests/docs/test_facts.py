@@ -173,9 +173,7 @@ LIMITS = {
         f"and {dense._SEARCH_FARTHER:.0%} behind it",
         f"1 / (1 / d + {dense._SEARCH_NEARER:g} W / (f b))",
     ),
-    "how-to/reflectance.md": (
-        f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",
-    ),
+    "how-to/reflectance.md": (f"calibration panels at most {panel_readings.MAX_LIGHT_APART_S / 3600:g} hours away",),
 }
 """{page: sentences with a limit of the program}."""
 

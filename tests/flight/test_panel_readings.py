@@ -218,6 +218,8 @@ def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
     on_another_field = replace(ground, capture=replace(ground.capture, position=Position(52.1, 5.0, 93.0)))
     assert with_height(high, [on_another_field]) == high
+    of_the_day_before = PanelReading(capture(HELD, "2026-06-20T10:30:00", position=GROUND), ())
+    assert with_height(high, [of_the_day_before]) == high
 
 
 def found(folder: Path, seconds: Iterable[int], shown: Sequence[int], undated: int | None = None) -> list[int]:
