@@ -295,7 +295,7 @@ class WriteSettings(SettingsModel):
     format: choices.RasterFormat = "gtiff"
     """Tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: choices.Compression = "auto"
-    """Lossless compression; auto is zstd for stacks and deflate for single bands."""
+    """Lossless compression; auto is zstd for stacks, else deflate."""
     undistort: bool = False
     """Remove the lens distortion of the reference band from the output."""
     layout: choices.Layout = "stack"

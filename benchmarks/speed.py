@@ -147,7 +147,7 @@ def floor_s(capture: Capture, folder: Path) -> float:
     known = {b.name: read_alignment(path, b.name).mapping for b in capture.moving}
     positions = {name: mapping.positions(Tile(0, 0, width, height), np.float32) for name, mapping in known.items()}
     profile = tiled_profile(width, height, len(capture.bands), capture.reference.dtype, interleave="band")
-    profile |= compressed("u", "zstd")
+    profile |= compressed("uint16", "zstd")
     began_s = time.process_time()
     planes = [read_band(band.path, band.band_index) for band in capture.bands]
     for k, band in enumerate(capture.bands):

@@ -30,7 +30,7 @@ from agalign.pixels.gdal import open_local
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, suffix_format
 from agalign.rasters.band_reader import RAW
-from agalign.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
+from agalign.rasters.geotiff import Block, LayerDescription, compressed, to_cog, write_on_grid
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.values import geometry
@@ -194,9 +194,8 @@ def write_raster(
     capture, settings, raw = context.capture, context.settings.write, context.is_raw
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(context, layers, dtype)
-    compression = compression_of(settings.compression, is_stack=is_stack)
     options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
-    options |= compressed(dtype.kind, compression)
+    options |= compressed(dtype.name, settings.compression, is_stack=is_stack)
     overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
 
     def finish(partial: Path) -> None:
@@ -207,7 +206,7 @@ def write_raster(
                 if overviews:
                     dataset.build_overviews(overviews, Resampling.average)
         if settings.format == "cog":
-            to_cog(partial, compression)
+            to_cog(partial)
         elif tags is not None:
             add_directories(partial, *tags)
 

@@ -12,7 +12,7 @@ from agalign.cameras.tag_seeds import rig_seed
 from agalign.errors import GeometryError
 from agalign.host.held_sizes import WORK_TILE_PX
 from agalign.pixels.masks import saturated
-from agalign.rasters.geotiff import LayerDescription, compressed
+from agalign.rasters.geotiff import LayerDescription
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.values import geometry, lens
@@ -126,8 +126,7 @@ class QualityRaster(Product):
             for index, flags in enumerate(flags_on(tile), start=1)
         )
         # There is no nodata value: 0 means that no flag is set.
-        options = compressed("u") | {"interleave": "band"}
-        return self.write_layers(context, layers, blocks, tags=tags, dtype="uint16", options=options)
+        return self.write_layers(context, layers, blocks, tags, dtype="uint16", options={"interleave": "band"})
 
 
 def _flags(

@@ -54,19 +54,20 @@ class LayerDescription:
     colour: ColorInterp | None = None
 
 
-def compressed(kind: str, method: Compression = "deflate") -> dict[str, Any]:
-    """Return the creation options of compressed pixels of a kind of numpy type: `f`, `i` or `u`.
-
-    `method` is not `auto`, which `compression_of` resolves.
+def compressed(dtype: str, choice: Compression = "auto", *, is_stack: bool = False) -> dict[str, Any]:
+    """Return the creation options of compressed pixels of a numpy type. With `auto`, they are zstd for a stack of all
+    bands of a capture, else deflate.
     """
+    # Programs that read files of single bands often lack Zstandard.
+    method = choice if choice != "auto" else "zstd" if is_stack else "deflate"
     if method == "none":
         return {}
     # TIFF predictor 3 is for floating point, 2 for integers.
-    options: dict[str, Any] = {"compress": method, "predictor": 3 if kind == "f" else 2}
+    options: dict[str, Any] = {"compress": method, "predictor": 3 if np.dtype(dtype).kind == "f" else 2}
     return options | ({"zstd_level": _ZSTD_LEVEL} if method == "zstd" else {})
 
 
-FLOAT_OPTIONS: Mapping[str, Any] = {**compressed("f"), "nodata": math.nan}
+FLOAT_OPTIONS: Mapping[str, Any] = {**compressed("float32"), "nodata": math.nan}
 """Creation options of layers of float32."""
 
 
@@ -193,16 +194,11 @@ def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any
     return {"transform": Affine(*transform[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 
 
-def compression_of(choice: Compression, *, is_stack: bool) -> Compression:
-    """Return the method for aligned bands: with `auto`, zstd for a stack of all bands of a capture, else deflate."""
-    if choice != "auto":
-        return choice
-    return "zstd" if is_stack else "deflate"  # programs that read files of single bands often lack Zstandard
-
-
-def to_cog(path: Path, compression: str = "deflate") -> None:
-    """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
+def to_cog(path: Path) -> None:
+    """Replace a GeoTIFF by a cloud-optimised one of its compression, with overviews. Errors are those of rasterio."""
     cog = path.with_name(f"{path.name}.cog")
+    with open_local(path) as file:
+        compression = file.profile.get("compress", "none")
     # GDAL's default size of blocks; its default compression is not none.
     options = {"blocksize": 512, "bigtiff": "if_safer", "compress": compression}
     if compression != "none":

@@ -26,7 +26,7 @@ from agalign.host.files import scratch_file
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import with_nodata, write_raster
-from agalign.rasters.geotiff import Block, LayerDescription, compressed
+from agalign.rasters.geotiff import Block, LayerDescription
 from agalign.rasters.output_grid import SCALE_DECIMALS, output_layers
 from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.values.capture import Band, Capture
@@ -60,10 +60,9 @@ class PanSharpened(Product):
         broad = panchromatic(capture)
         if not broad or not {b.name for b in broad} <= {capture.reference.name, *usable}:
             return []
-        fine = {"resolution": "finest", "format": "gtiff", "compression": "none", "statistics": False}
-        settings = context.settings.write.model_copy(update=fine)
-        layers, grid = output_layers(capture, usable, settings, context.options.fine, context.read)
-        context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
+        context = _with_write(context, resolution="finest", format="gtiff", statistics=False)
+        layers, grid = output_layers(capture, usable, context.settings.write, context.options.fine, context.read)
+        context = replace(context, grid=grid)
         pan = [la for la in layers if la.band in broad]
         others = [
             la
@@ -73,13 +72,18 @@ class PanSharpened(Product):
         if not any(is_in_range(la.band, broad) for la in others):
             return []
         with scratch_file(path) as unsharpened:
-            write_raster(context, [*others, *pan], unsharpened)
+            write_raster(_with_write(context, compression="none"), [*others, *pan], unsharpened)
             with open_raster(unsharpened) as file:
                 bands, scale = [la.band for la in others], max(grid.scale)
                 descriptions, blocks = sharpened(file, bands, broad, scale, is_raw=context.is_raw)
-                options = compressed(np.dtype(file.dtypes[0]).kind) | {"interleave": "band", "nodata": file.nodata}
-                more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
-                return self.write_layers(context, descriptions, blocks, **more)
+                options, dtype = {"interleave": "band", "nodata": file.nodata}, file.dtypes[0]
+                return self.write_layers(context, descriptions, blocks, file.tags(), dtype=dtype, options=options)
+
+
+def _with_write(context: ProductContext, **changes: object) -> ProductContext:
+    """Return the input of a product with other settings for the output."""
+    write = context.settings.write.model_copy(update=changes)
+    return replace(context, settings=context.settings.model_copy(update={"write": write}))
 
 
 def scale_of_earlier(path: Path, common: OutputGrid) -> float | None:

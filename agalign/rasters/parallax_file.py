@@ -31,7 +31,7 @@ def write_parallax(path: Path, relief: Relief, georeference: Georeference | None
     ]
     steps = (np.rint(layer.astype(np.float64) / RELIEF_STEP).astype(np.int32) for layer in values)
     blocks = ((layer, index, 0, 0) for index, layer in enumerate(steps, start=1))
-    grid, options = OutputGrid(0, 0, width, height), compressed("i") | {"interleave": "band"}
+    grid, options = OutputGrid(0, 0, width, height), compressed("int32") | {"interleave": "band"}
     write_on_grid(path, grid, georeference, layers, blocks, dtype="int32", options=options)
 
 

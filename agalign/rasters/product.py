@@ -12,7 +12,7 @@ from agalign.config import Settings, WriteSettings
 from agalign.host.files import file_checksum
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.drawing import Grey, ReducedBands, read_reduced_bands
-from agalign.rasters.geotiff import Block, LayerDescription, write_on_grid
+from agalign.rasters.geotiff import Block, LayerDescription, compressed, write_on_grid
 from agalign.rasters.output_grid import Layer
 from agalign.records.sidecar import PreviewPart, Sidecar
 from agalign.values.alignment import Alignment
@@ -200,12 +200,21 @@ class Product(ABC):
         """
 
     def write_layers(
-        self, context: ProductContext, layers: Sequence[LayerDescription], blocks: Iterable[Block], **options: Any
+        self,
+        context: ProductContext,
+        layers: Sequence[LayerDescription],
+        blocks: Iterable[Block],
+        tags: Mapping[str, str] = {},
+        *,
+        dtype: str = "float32",
+        options: Mapping[str, Any] = {"nodata": math.nan},
     ) -> list[WrittenFile]:
-        """Write one raster on the grid of the capture, with these options of `write_on_grid`, and return it.
+        """Write one raster on the grid of the capture, with these creation options and the compression that is set, and
+        return it.
 
         Raises OutputError.
         """
         path, georeference = context.paths.file(self.suffix), context.capture.reference.georeference
-        write_on_grid(path, context.grid, georeference, layers, blocks, **options)
+        options = {**compressed(dtype, context.settings.write.compression), **options}
+        write_on_grid(path, context.grid, georeference, layers, blocks, tags=tags, dtype=dtype, options=options)
         return [WrittenFile(self.kind, path)]

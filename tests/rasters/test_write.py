@@ -13,9 +13,11 @@ from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.rasters.aligned_files import BandFiles, Stack, write_raster
+from agalign.rasters.alignment_maps import ErrorMap, QualityRaster
 from agalign.rasters.band_reader import RAW, BandReader
 from agalign.rasters.geotiff import Block, LayerDescription, write_on_grid
 from agalign.rasters.output_grid import Layer, common_grid, flight_limits, output_layers
+from agalign.rasters.pan_sharpen import PanSharpened
 from agalign.records.captures import AlignedBand
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
@@ -98,6 +100,21 @@ def test_files_of_bands_have_one_compression(tmp_path: Path, layout: str, number
         (written,) = product.write(context)
         with rasterio.open(written.path) as file:
             assert (file.count, file.profile["compress"]) == (number, compression)
+
+
+@pytest.mark.parametrize(("compression", "of_file"), [("auto", "deflate"), ("zstd", "zstd"), ("none", None)])
+def test_rasters_of_a_capture_have_its_compression(tmp_path: Path, compression: str, of_file: str | None) -> None:
+    capture = make_capture(tmp_path)
+    pan = replace(capture.bands[2], name="Panchro", bandwidth_nm=400.0)
+    capture = replace(capture, bands=(*capture.bands[:2], pan))
+    alignments = {band.name: aligned(SHIFT, band.size_px) for band in capture.moving}
+    context = context_of(capture, alignments, tmp_path, layers_of(capture), CROP, compression=compression)
+    for product in (PanSharpened(), ErrorMap(), QualityRaster()):
+        (written,) = product.write(context)
+        with rasterio.open(written.path) as file:
+            assert file.profile.get("compress") == of_file, product.kind
+    with rasterio.open(write(capture, CROP, compression=compression, format="cog")) as file:
+        assert file.profile.get("compress") == of_file
 
 
 def test_a_band_without_calibration_beside_calibrated_ones_has_raw_numbers(tmp_path: Path) -> None:
