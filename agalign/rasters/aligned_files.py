@@ -194,7 +194,9 @@ def write_raster(
     capture, settings, raw = context.capture, context.settings.write, context.is_raw
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(context, layers, dtype)
-    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
+    # GDAL writes no COG of uncompressed pixels that are interleaved by band.
+    interleave = "pixel" if (settings.format, settings.compression) == ("cog", "none") else "band"
+    options: dict[str, object] = {"interleave": interleave, "photometric": "minisblack", "nodata": nodata}
     options |= compressed(dtype.name, settings.compression, is_stack=is_stack)
     overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
 

@@ -115,6 +115,7 @@ def test_rasters_of_a_capture_have_its_compression(tmp_path: Path, compression: 
             assert file.profile.get("compress") == of_file, product.kind
     with rasterio.open(write(capture, CROP, compression=compression, format="cog")) as file:
         assert file.profile.get("compress") == of_file
+        assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
 
 
 def test_a_band_without_calibration_beside_calibrated_ones_has_raw_numbers(tmp_path: Path) -> None:
