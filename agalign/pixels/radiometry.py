@@ -8,6 +8,7 @@ y is the row and r the distance from the vignetting centre, px of the band's own
 from the light sensor or from a panel of known reflectance. Thermal bands are not converted.
 """
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -36,7 +37,9 @@ _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "irradiance (W / m^2 / nm)": (0.005, 3.0),  # from sunset (0.6 % of a clear noon) to 1.5 times a clear noon
     "relative irradiance": (10.0, 1e6),  # 7,000 to 17,000 in the sun
 }
-"""Ranges of the values that radiance and reflectance are calculated from; others are of damaged tags."""
+"""Ranges of the values that radiance and reflectance are calculated from; others are of damaged tags. A factor without
+a range must be a finite number.
+"""
 _MAX_BELOW_BLACK = 0.01
 """Minimum median of a band above the black level, negative, relative to the full scale. Water in the near infrared is
 at the black level, which drifts by 0.5 % of the full scale.
@@ -77,7 +80,7 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
         kind = "irradiance (W / m^2 / nm)" if radiometry.by_sun.quantity == "reflectance" else "relative irradiance"
         values.setdefault(kind, radiometry.irradiance or 0.0)
     for name, value in values.items() if radiometry.is_of_light else ():
-        low, high = _PLAUSIBLE[name]
+        low, high = _PLAUSIBLE.get(name, (-sys.float_info.max, sys.float_info.max))
         for wrong in (v for v in np.ravel(value).tolist() if not low <= v <= high):
             rest = replace(radiometry, by_sun=None) if "irradiance" in name else None
             return rest, f"the {name} of {wrong:g} is not within {low:g} to {high:g}"

@@ -130,6 +130,7 @@ GOOD = Radiometry(
         ({"tags": {"exposure time (s)": 1.44}}, "exposure time (s) of 1.44"),  # of 1.44 ms
         ({"tags": {"sensor gain": -1.0}}, "sensor gain of -1"),
         ({"tags": {"gain adjustment": 1e-3}}, "gain adjustment"),
+        ({"tags": {"factor of a new camera": math.inf}}, "factor of a new camera of inf"),
         ({"black_level": 30000.0}, "black level of 30000"),
         ({"black_level": -1.0}, "black level of -1"),
         ({"vignetting": (1e300,)}, "vignetting"),
@@ -147,6 +148,8 @@ def test_a_calibration_with_an_implausible_tag_is_not_used(change: dict[str, obj
     known = (math.pi / 0.02, "reflectance"), (math.pi / 1.9, "reflectance"), (1 / 500, "relative reflectance")
     for by_sun in (ReflectanceFactor(*one) for one in known):
         assert plausible(replace(GOOD, by_sun=by_sun), (1280, 960)) == (replace(GOOD, by_sun=by_sun), "")
+    of_new_camera = replace(GOOD, tags={"factor of a new camera": -2.0})
+    assert plausible(of_new_camera, (1280, 960)) == (of_new_camera, "")
     result, problem = plausible(replace(GOOD, **change), (1280, 960))
     assert result == (replace(GOOD, by_sun=None) if "irradiance" in named else None)
     assert problem.startswith(f"the {named}")
