@@ -6,7 +6,7 @@ from pathlib import Path
 
 from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.model_tables import filter_channels, named_by_camera
+from agalign.cameras.model_tables import filter_channels, filtered_bands, named_by_camera
 from agalign.cameras.pix4d import NAMESPACE, listed_bands
 from agalign.host.text import shortened
 from agalign.pixels.raster import suffix_format
@@ -41,7 +41,7 @@ class Generic(Camera):
             # The channels of a camera with a filter have other bands than their colours, whatever the pattern.
             channels = filter_channels(tags.model)
             if len(stored) == len(channels):
-                stored = [replace(b, name=(c := channels[b.band_index])[0], wavelength_nm=c[1]) for b in stored]
+                stored = filtered_bands(channels, stored)
             listed = listed_bands(tags, stored)
             own = [named_by_camera(b.name)[1] for b in listed]
             names = own if all(own) and len(set(own)) == len(own) else [b.name for b in listed]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags
-from agalign.cameras.model_tables import SURVEY3_FILTERS, filter_channels
+from agalign.cameras.model_tables import SURVEY3_FILTERS, filter_channels, filtered_bands, survey3_filter
 from agalign.values.band_names import own_stem
 from agalign.values.capture import Band
 
@@ -32,13 +32,14 @@ class Mapir(Camera):
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if len(stored) > 1:
-            channels = filter_channels(tags.model)
-            named = [(b, *channels.get(b.band_index, (f"band_{b.band_index}", None))) for b in stored]
-            return tuple(replace(b, name=name, wavelength_nm=nm, one_lens=True) for b, name, nm in named)
+            known = filtered_bands(filter_channels(tags.model), stored)
+            unnamed = (replace(b, name=f"band_{b.band_index}", wavelength_nm=None) for b in stored)
+            return tuple(replace(b, one_lens=True) for b in known or unnamed)
         bandpass = re.search(r"-F(?P<wavelength>\d{3,4})$", tags.model)
         if not bandpass:
             file = _FILE.match(own_stem(path))
-            return (replace(stored[0], name=f"band_{file['serial']}" if file else path.stem),)
+            by_model = survey3_filter(tags.model) or "band_1"
+            return (replace(stored[0], name=f"band_{file['serial']}" if file else by_model),)
         wavelength_nm = float(bandpass["wavelength"])
         longest_nm = {"Blue": 500, "Green": 600, "Red": 690, "Red edge": 760, "NIR": 1100}
         name = next((n for n, nm in longest_nm.items() if wavelength_nm <= nm), f"{wavelength_nm:g}nm")

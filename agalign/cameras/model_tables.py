@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from agalign.values.capture import Band
 from agalign.values.spectrum import band_key
@@ -59,10 +60,21 @@ SURVEY3_FILTERS: Mapping[str, Channels] = {
 }
 
 
+def survey3_filter(model: str) -> str:
+    """Return the filter in the model of a MAPIR Survey3, such as RGN; empty for other models."""
+    name, _, of_filter = model.upper().rpartition("_")
+    return of_filter if name.startswith("SURVEY3") else ""
+
+
 def filter_channels(model: str) -> Channels:
     """Return the bands in the channels of a MAPIR Survey3 by the filter in its model; empty for other models."""
-    name, _, of_filter = model.upper().rpartition("_")
-    return SURVEY3_FILTERS.get(of_filter, {}) if name.startswith("SURVEY3") else {}
+    return SURVEY3_FILTERS.get(survey3_filter(model), {})
+
+
+def filtered_bands(channels: Channels, stored: Sequence[Band]) -> tuple[Band, ...]:
+    """Return the bands behind a filter in the channels of a photograph, without channels that have none."""
+    known = [(band, *channels[band.band_index]) for band in stored if band.band_index in channels]
+    return tuple(replace(band, name=name, wavelength_nm=nm) for band, name, nm in known)
 
 
 def sizes_px(model: str) -> tuple[tuple[int, int], ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.model_tables import SENTERA_FILTERS
+from agalign.cameras.model_tables import SENTERA_FILTERS, filtered_bands
 from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
@@ -63,11 +63,7 @@ def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band
     if bandpass is None:
         # The colour camera of the Double 4K takes part by default, that of the 6X does not.
         return tuple(replace(b, is_from_photograph="6X" in tags.model.upper()) for b in colour_bands(stored))
-    return tuple(
-        replace(stored[index - 1], name=name, wavelength_nm=wavelength, one_lens=True)
-        for index, (name, wavelength) in SENTERA_FILTERS[bandpass].items()
-        if index <= len(stored)
-    )
+    return tuple(replace(b, one_lens=True) for b in filtered_bands(SENTERA_FILTERS[bandpass], stored))
 
 
 def _listed_bands(tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:

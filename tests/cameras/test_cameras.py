@@ -107,6 +107,15 @@ def test_an_alpha_band_that_is_not_the_last_shifts_no_index(tmp_path: Path) -> N
         file.colorinterp = [ColorInterp.gray, ColorInterp.alpha, ColorInterp.undefined, ColorInterp.undefined]
     result = Mapir().bands(path, Tags(make="MAPIR", model="Survey3"), probe(path))
     assert [(b.name, b.band_index) for b in result] == [("band_1", 1), ("band_3", 3), ("band_4", 4)]
+    result = Generic().bands(path, Tags(make="MAPIR", model="Survey3W_RGN"), probe(path))
+    assert [(b.name, b.band_index) for b in result] == [("Red", 1), ("NIR", 3)]
+
+
+@pytest.mark.parametrize(("model", "name"), [("Survey3W_RE", "RE"), ("Survey3W", "band_1")])
+def test_a_survey3_file_of_one_band_has_the_name_of_its_filter(tmp_path: Path, model: str, name: str) -> None:
+    stored = Band("", tmp_path / "2021_0827_193517_009.tif", 1, 80, 64, "uint8")
+    (band,) = Mapir().bands(stored.path, Tags(make="MAPIR", model=model), (stored,))
+    assert band.name == name
 
 
 # ---- MicaSense
