@@ -21,7 +21,7 @@ from agalign.values import remedies
 from agalign.values.capture import MIN_APART_S, CaptureTime
 from agalign.values.issues import OF_FILES
 from agalign.values.mapping_error import MAX_PIXEL_ERROR_PX
-from agalign.values.radiometric_errors import PANEL_AND_SENSOR
+from agalign.values.radiometric_errors import PANEL_AND_SENSOR, change_of_light
 from agalign.values.remedies import Remedy
 
 MIN_SHARE_OVER_1_PX = 0.01
@@ -33,8 +33,8 @@ _MIN_OFF_STD = 3.0
 """Distance from the prediction relative to its standard error: normal errors are larger in 1 % of the bands."""
 _MAX_SATURATED_SHARE = 0.005
 """Sun glint and roofs saturate fewer pixels of most captures."""
-_MAX_PANEL_AGE_S, _CHANGE_OF_LIGHT = 30 * 60.0, 0.1
-"""Under a clear sky with the sun above 40 degrees, the irradiance changes by up to this share in this time."""
+_MAX_PANEL_AGE_S = 30 * 60.0
+"""The irradiance changes by up to 10 % in this time (`change_of_light`)."""
 _UNVERIFIED_PIXELS = 0.5
 """Share of the values of a predicted band that count as wrong if its image shows too little: the values of blur and
 noise are wrong at edges, those of water and fog are not."""
@@ -151,7 +151,7 @@ class RunFacts:
                 is_unusable = error > _MAX_REFLECTANCE_ERROR and is_by_sensor
                 yield Caution(band, remedy, reason, min(1.0, error), error, text, is_unusable=is_unusable)
             if age_s > _MAX_PANEL_AGE_S and not is_by_sensor:
-                lost = min(1.0, _CHANGE_OF_LIGHT * age_s / _MAX_PANEL_AGE_S)
+                lost = min(1.0, change_of_light(age_s))
                 reason = f"the nearest panel is {age_s / 60:.0f} min away"
                 yield Caution(band, remedies.OLD_PANEL, reason, lost, age_s, f"up to {age_s / 60:.0f} min")
 

@@ -40,8 +40,8 @@ one field with corrections of 20 % differ by 7 %, three captures of another one 
 """
 _SATURATED_SHARE = 0.5
 """Of a saturated pixel: its value is a lower limit, and sensors that saturate are mostly overexposed by up to 2."""
-_LIGHT_PER_HOUR = 20.0
-"""Change of the irradiance in an hour, percent: with the sun above 40 degrees, up to 10 % in 30 minutes."""
+_LIGHT_PER_HOUR = 0.2
+"""Share by which the irradiance changes in an hour under a clear sky with the sun above 40 degrees, at most."""
 
 
 def tilt_error(correction: float) -> RadiometricError:
@@ -66,13 +66,18 @@ def too_bright(median: float) -> RadiometricError:
     return contradiction(BRIGHT, max_usual, median)
 
 
+def change_of_light(age_s: float) -> float:
+    """Return the share by which the irradiance may have changed since a panel was recorded."""
+    return _LIGHT_PER_HOUR * age_s / 3600
+
+
 def panel_errors(spread: float, age_s: float | None) -> tuple[RadiometricError, ...]:
     """Return the errors of a factor by a panel, given the standard deviation of its pixels relative to their mean, and
     the time to the capture if the light since then is not known.
     """
     errors = [PANEL, RadiometricError("homogeneity of the panel", 100 * spread)]
     if age_s is not None:
-        errors.append(RadiometricError("light since the panel", _LIGHT_PER_HOUR * age_s / 3600))
+        errors.append(RadiometricError("light since the panel", 100 * change_of_light(age_s)))
     return tuple(errors)
 
 
