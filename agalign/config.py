@@ -29,7 +29,7 @@ def names_in(text: str | None) -> tuple[str, ...]:
 def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
     """Return (band in lower case, reflectance) from 'Blue=0.51,NIR=0.49', or ("", reflectance) from one number.
 
-    Raises ConfigurationError for a reflectance that is not in (0, 1], and for a second one of a band.
+    Raises ConfigurationError for a reflectance that is not in (0, 1].
     """
     result: list[tuple[str, float]] = []
     for part in names_in(text):
@@ -40,11 +40,16 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
             value = 0.0
         if not 0 < value <= 1:
             raise ConfigurationError(f"--panel-albedo {text}: '{part}' is not a reflectance between 0 and 1")
-        band = name.strip().lower()
-        if any(band_key(band) == band_key(other) for other, _ in result):
-            raise ConfigurationError(f"--panel-albedo {text}: has two reflectances of {band or 'all bands'}")
-        result.append((band, value))
+        result.append((name.strip().lower(), value))
     return tuple(result)
+
+
+def _one_of_each_band(given: tuple[tuple[str, float], ...]) -> tuple[tuple[str, float], ...]:
+    """Return reflectances of the panel. Raises ConfigurationError for two of a band."""
+    keys = [band_key(name) for name, _ in given]
+    if repeated := [name for number, (name, _) in enumerate(given) if keys[number] in keys[:number]]:
+        raise ConfigurationError(f"--panel-albedo: has two reflectances of {repeated[0] or 'all bands'}")
+    return given
 
 
 @dataclass(frozen=True)
@@ -333,7 +338,9 @@ class WriteSettings(SettingsModel):
     light sensor, sun, panel alone, camera. Thermal bands become degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
-        tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
+        tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...],
+        Option(type=str | None, parse=albedos),
+        AfterValidator(_one_of_each_band),
     ] = ()
     """Reflectance of the calibration panel, such as 0.51 or Blue=0.51,NIR=0.49, instead of that in tags or QR code."""
 

@@ -83,13 +83,10 @@ def _selected(
 
 
 def _check_albedos(found: Sequence[Capture], write: WriteSettings) -> None:
-    """Raise ConfigurationError for a band of --panel-albedo that has two values, or that no capture has."""
+    """Raise NoSuchBandError for a band of --panel-albedo that no capture has."""
     known = {band_key(band.name): band.name for capture in found for band in capture.bands}
-    keys = [band_key(name) for name, _ in write.panel_albedo]
-    for number, (name, _) in enumerate(write.panel_albedo if found else ()):
-        if keys[number] in keys[:number]:
-            raise ConfigurationError(f"--panel-albedo: has two reflectances of {name or 'all bands'}")
-        if name and keys[number] not in known:
+    for name, _ in write.panel_albedo if found else ():
+        if name and band_key(name) not in known:
             raise no_such_band(found[0].reference.path, name, known.values(), by="--panel-albedo")
 
 
