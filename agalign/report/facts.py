@@ -26,7 +26,7 @@ from agalign.report.page_data import DataParts
 from agalign.report.pair_totals import CautionGroup, PairTotals
 from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
 from agalign.spectral_indices.formulas import index_named
-from agalign.spectral_indices.picture import PICTURE_PX
+from agalign.spectral_indices.picture import INDEX_COLOURS, INDEX_GREYS, PICTURE_PX
 from agalign.spectral_indices.rasters import IndexReport, reason_not_written
 from agalign.values.alignment import Prediction
 from agalign.values.remedies import NO_RESULT
@@ -185,6 +185,8 @@ class FlightFacts:
             "min_share_over_1_px": MIN_SHARE_OVER_1_PX,
             "error_full_px": ERROR_FULL_PX,
             "index_picture_px": PICTURE_PX,
+            "index_colours": INDEX_COLOURS,
+            "index_greys": INDEX_GREYS,
             "rows": self._rows.first,
             "details": self._details.first,
             "details_per_part": _DETAILS_PER_PART,

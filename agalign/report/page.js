@@ -38,10 +38,10 @@
  * @typedef {{from: number, records: Row[]}} Rows
  * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
  *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
- * @typedef {{captures: number, shift_step_px: number, min_share_over_1_px: number, error_full_px: number, index_picture_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
+ * @typedef {{captures: number, shift_step_px: number, min_share_over_1_px: number, error_full_px: number, index_picture_px: number, index_colours: number[][], index_greys: number[][], rows: Rows | null, details: Details | null, details_per_part: number,
  *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others. The
  *   colours of errors and residuals are full at `error_full_px`; `index_picture_px` is the longer side of the image in the
- *   picture of an index, above the histogram.
+ *   picture of an index, above the histogram; its colours and greys are stops at equal distances.
  * @typedef {{column: number, colour: string}} Channel
  * @typedef {"before" | "after"} When
  * @typedef {[text: string, term?: string]} Head The head of a column, and its term in the help of the page.
@@ -344,8 +344,6 @@ function tableBody() {
 const MAP = { width: 900, height: 420, few: 230, margin: 34 };
 const ONE_PLACE_M = 0.5;
 const MAP_FULL_PX = 1; // fixed, so that colours mean the same in every report; above it single plants do not match
-const INDEX_STOPS = [[38, 70, 148], [120, 74, 40], [214, 190, 120], [250, 245, 170], [90, 180, 80], [0, 90, 40]];
-const NEUTRAL_STOPS = [[20, 20, 20], [245, 245, 245]];
 const MISSING_COLOUR = "#c9a";
 const RAW_NOTE = "From raw numbers, not reflectance: values of different captures are not comparable.";
 /** @type {Map<Row, Element>} */
@@ -448,12 +446,9 @@ function indexNames() {
   return [...new Set(captures.flatMap((c) => Object.keys(c.indices)))];
 }
 
-/**
- * As agalign/spectral_indices/rasters.py has them.
- * @param {number} share @param {boolean} raw
- */
+/** @param {number} share @param {boolean} raw */
 function indexColour(share, raw) {
-  const stops = raw ? NEUTRAL_STOPS : INDEX_STOPS;
+  const stops = raw ? facts.index_greys : facts.index_colours;
   const at = Math.min(1, Math.max(0, share)) * (stops.length - 1);
   const k = Math.min(stops.length - 2, Math.floor(at));
   return `rgb(${stops[k].map((v, i) => Math.round(v + (at - k) * (stops[k + 1][i] - v))).join(" ")})`;
@@ -1009,7 +1004,7 @@ function overIndexBefore(pen, capture, at) {
   const [preview, index] = [capture.preview, indexOf(capture)];
   const column = preview && index ? preview.indices.indexOf(index.name) : -1;
   if (!preview || !index || column < 0) return;
-  const made = dyed(preview, "indices", column, index.raw ? NEUTRAL_STOPS : INDEX_STOPS);
+  const made = dyed(preview, "indices", column, index.raw ? facts.index_greys : facts.index_colours);
   const [x, y] = at(0, 0);
   const [right, bottom] = at(1, 1);
   pen.globalAlpha = INDEX_OPACITY;

@@ -13,10 +13,10 @@ from agalign.values.image import reduced_size_px
 
 PICTURE_PX = 720
 """Longer side of the image at the top left of a picture, which the report overlays on the composite."""
-_COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
+INDEX_COLOURS = (38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
-_NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
-"""Greys for raw numbers, whose values do not distinguish soil and vegetation."""
+INDEX_GREYS = (20, 20, 20), (245, 245, 245)
+"""The same for raw numbers, whose values do not distinguish soil and vegetation."""
 
 
 def write_picture(
@@ -30,7 +30,7 @@ def write_picture(
     with open_raster(raster) as dataset:
         size_px = dataset.width, dataset.height
         values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / PICTURE_PX))[::-1])
-    ramp = _NEUTRAL if is_raw else _COLOURS
+    ramp = np.array(INDEX_GREYS if is_raw else INDEX_COLOURS, float)
     shape = values.shape
     width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
     # In float64: a value clipped in float32 may be just outside the span.

@@ -279,7 +279,7 @@ def test_pictures_in_stops_are_exact(viewer: Any) -> None:
           [grey.width, grey.height] = [256, 8];
           const pen = grey.getContext("2d");
           for (let v = 0; v < 256; v += 1) { pen.fillStyle = `rgb(${v} ${v} ${v})`; pen.fillRect(v, 0, 1, 8); }
-          window.made = [INDEX_STOPS, NEUTRAL_STOPS, [FAR, NEAR]].map((stops) => {
+          window.made = [facts.index_colours, facts.index_greys, [FAR, NEAR]].map((stops) => {
             const made = inStops(grey, [0, 0, 256, 8], stops).getContext("2d").getImageData(0, 4, 256, 1).data;
             const wanted = [...Array(256).keys()].map((v) => {
               const at = v / 255 * (stops.length - 1);
