@@ -169,11 +169,12 @@ def _indices(
     """
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster
+    from agalign.config import names_in
     from agalign.errors import OutputError, WorkerError
     from agalign.host.output_folder import locked
     from agalign.spectral_indices.formulas import chosen_indices
 
-    names = (index or ("" if formula else "ndvi")).split(",")
+    names = names_in(index or ("" if formula else "ndvi"))
     chosen = chosen_indices(names, formula or [])
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)

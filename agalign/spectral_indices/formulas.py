@@ -187,7 +187,7 @@ INDICES: Mapping[str, Index] = {
 
 def chosen_indices(names: Sequence[str], formulas: Sequence[str] = ()) -> list[Index]:
     """Return the indices of names and formulas. Raises ConfigurationError for an unknown or a repeated one."""
-    chosen = [index_named(name) for name in names if name.strip()] + [index_of_formula(f) for f in formulas]
+    chosen = [index_named(name) for name in names] + [index_of_formula(f) for f in formulas]
     repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
     if repeated:
         raise ConfigurationError(f"index '{repeated[0]}' is given twice; give it once, and formulas as 'name=N/R'")

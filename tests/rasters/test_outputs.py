@@ -152,7 +152,11 @@ def test_an_index_of_bands_in_different_units_is_a_problem_of_every_run_and_no_d
 
 @pytest.mark.parametrize(
     ("index", "problem"),
-    [("ndre", "no capture has them all; there are green"), ("savi", "needs reflectance; add --radiometry")],
+    [
+        ("ndre", "no capture has them all; there are green"),
+        ("savi", "needs reflectance; add --radiometry"),
+        (" ", "unknown index ''; choose from ndvi"),
+    ],
 )
 @pytest.mark.usefixtures("pan_capture")
 def test_an_index_that_no_capture_can_have_is_refused_first(tmp_path: Path, index: str, problem: str) -> None:
