@@ -17,6 +17,7 @@ from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
 
 if TYPE_CHECKING:
+    from agalign.batch.index_run import IndexTask
     from agalign.spectral_indices.rasters import IndexReport
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
@@ -167,20 +168,42 @@ def _indices(
         agalign indices aligned/  NDVI of every capture, next to its stack
         agalign indices aligned/ --index ndvi,ndre,savi -o indices/  three indices, into another folder
     """
-    from agalign.batch.index_run import index_tasks, run_indices
-    from agalign.cli.align_run import cluster
+    from agalign.batch.index_run import index_tasks
     from agalign.config import names_in
-    from agalign.errors import OutputError, WorkerError
-    from agalign.host.output_folder import locked
     from agalign.spectral_indices.formulas import chosen_indices
 
-    names = names_in(index or ("" if formula else "ndvi"))
-    chosen = chosen_indices(names, formula or [])
-    folder, jobs = target or out, given["run"]["jobs"]
-    tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
+    folder, run = target or out, given["run"]
+    chosen = chosen_indices(names_in(index or ("" if formula else "ndvi")), formula or [])
+    tasks = index_tasks(out, chosen, folder, overwrite=run["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
-    dask, problems = given["run"]["executor"], list[str]()
+    reports, problems = _run_indices(tasks, folder, terminal, run["jobs"], run["executor"])
+    is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)
+    for problem in problems:
+        terminal.problem(problem)
+    written = [r for r in reports if r.path is not None]
+    if as_json:
+        terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
+    elif written:
+        _print_statistics([one.name for one in chosen], reports, terminal)
+        if not problems:
+            terminal.result(f"Statistics: {folder / INDICES_FILE}")
+    is_complete = len(written) == len(reports) and not problems and not is_unfinished
+    return ExitCode.NOTHING if not written else ExitCode.OK if is_complete else ExitCode.PARTIAL
+
+
+def _run_indices(
+    tasks: "Sequence[IndexTask]", folder: Path, terminal: Terminal, jobs: int, dask: str | None
+) -> "tuple[list[IndexReport], list[str]]":
+    """Write indices to a folder, and print them; return their reports, and why captures are missing, or what the table
+    or the report lacks.
+    """
+    from agalign.batch.index_run import run_indices
+    from agalign.cli.align_run import cluster
+    from agalign.errors import OutputError, WorkerError
+    from agalign.host.output_folder import locked
+
     reports: list[IndexReport] = []
+    problems: list[str] = []
     are_raw = False
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         try:
@@ -194,18 +217,7 @@ def _indices(
                     show(number, done[0].capture, 0)
         except (OutputError, WorkerError) as error:  # the rasters that were reported, and their statistics, exist
             problems.append(str(error))
-    is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)
-    for problem in problems:  # why captures are missing, or what the table or the report lacks
-        terminal.problem(problem)
-    written = [r for r in reports if r.path is not None]
-    if as_json:
-        terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
-    elif written:
-        _print_statistics([one.name for one in chosen], reports, terminal)
-        if not problems:
-            terminal.result(f"Statistics: {folder / INDICES_FILE}")
-    is_complete = len(written) == len(reports) and not problems and not is_unfinished
-    return ExitCode.NOTHING if not written else ExitCode.OK if is_complete else ExitCode.PARTIAL
+    return reports, problems
 
 
 def _print_statistics(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
