@@ -20,7 +20,7 @@ from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoSuchBandError
 from agalign.host.text import counted
 from agalign.pixels.coordinates import metres_per_unit, transformed
-from agalign.pixels.raster import probe, suffix_format
+from agalign.pixels.raster import IMAGE_KINDS, probe, suffix_format
 from agalign.values import geometry
 from agalign.values.arguments import checked
 from agalign.values.band_names import no_such_band
@@ -147,7 +147,7 @@ def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], 
     if not paths:
         others = ", ".join(f"{count} {suffix}" for suffix, count in image_search.other_files(folder).most_common(5))
         only = f"; there are only {others}" if others else ""
-        raise InputError(f"{folder}: no {image_search.IMAGE_KINDS} file in it or below it{only}")
+        raise InputError(f"{folder}: no {IMAGE_KINDS} file in it or below it{only}")
     return paths, problems
 
 

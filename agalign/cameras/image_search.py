@@ -14,8 +14,6 @@ from agalign.host.own_files import has_mark
 from agalign.host.text import counted
 from agalign.pixels.raster import suffix_format
 
-IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
-
 
 def check_folder(folder: Path) -> None:
     """Raise InputError if `folder` is not a folder that can be listed."""

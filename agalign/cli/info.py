@@ -133,7 +133,8 @@ def _is_of(path: Path, capture: "Capture") -> bool:
 
 def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
     """Print what a folder without captures contains, and why none of it is used."""
-    from agalign.cameras.image_search import IMAGE_KINDS, image_files, other_files
+    from agalign.cameras.image_search import image_files, other_files
+    from agalign.pixels.raster import IMAGE_KINDS
 
     reasons: Counter[tuple[str, str]] = Counter()
     known = {p.path: p.text.removeprefix(f"{p.path}: ") for p in flight.problems}

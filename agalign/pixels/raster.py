@@ -41,13 +41,16 @@ _COPY_AGAIN, _CONVERT = "copy it from the card again", "convert it to TIFF (gdal
 
 Format = Literal["TIFF", "JPEG", "PNG", "JPEG 2000"]
 _FORMATS: dict[str, Format] = {".tif": "TIFF", ".tiff": "TIFF", ".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
-_FORMATS |= {".jp2": "JPEG 2000", ".j2k": "JPEG 2000"}
-"""JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits. JPEG 2000 is refused."""
+"""JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits."""
+_REFUSED: dict[str, Format] = {".jp2": "JPEG 2000", ".j2k": "JPEG 2000"}
+*_suffixes, _last_suffix = _FORMATS
+IMAGE_KINDS = f"{', '.join(_suffixes)} or {_last_suffix}"
+"""The files that are read, in words."""
 
 
 def suffix_format(path: Path) -> Format | None:
-    """Return the format of a file by its suffix; None for other files."""
-    return _FORMATS.get(path.suffix.lower())
+    """Return the format of a file by its suffix, also if it is refused; None for other files."""
+    return (_FORMATS | _REFUSED).get(path.suffix.lower())
 
 
 ReadTile = Callable[[Band, Tile], tuple[NDArray[np.generic], Mask]]
@@ -109,8 +112,8 @@ def _driver_of(path: Path) -> str:
     for driver, starts in drivers.items():
         if magic.startswith(starts):
             return driver
-    if suffix_format(path) == "JPEG 2000":
-        raise UnreadableFileError(f"{path}: JPEG 2000 is not supported", _CONVERT)
+    if refused := _REFUSED.get(path.suffix.lower()):
+        raise UnreadableFileError(f"{path}: {refused} is not supported", _CONVERT)
     problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
     raise UnreadableFileError(f"{path}: {problem}", _COPY_AGAIN)
 
