@@ -334,9 +334,15 @@ class CsvTable:
         self._writer.writerow(columns)
 
     def add(self, row: Sequence[object] | Mapping[str, object]) -> None:
-        """Add a row, or cells by column; None and a missing one become an empty cell, and formulas are quoted."""
-        cells = [row.get(name) for name in self._columns] if isinstance(row, Mapping) else row
-        self._writer.writerow(map(without_formula, cells))
+        """Add a row, or cells by column; None and a missing one become an empty cell, and formulas are quoted.
+
+        Raises KeyError for a cell without a column, which the caller has to name.
+        """
+        if isinstance(row, Mapping):
+            if unknown := row.keys() - set(self._columns):
+                raise KeyError(f"no column {', '.join(sorted(unknown))}")
+            row = [row.get(name) for name in self._columns]
+        self._writer.writerow(map(without_formula, row))
 
     def write(self, path: Path) -> None:
         """Write the table atomically. Raises OutputError."""

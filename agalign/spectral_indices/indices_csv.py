@@ -20,8 +20,10 @@ from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.formulas import Index, bands_for
 from agalign.spectral_indices.rasters import IndexRaster, IndexReport, IndexStatistics
 
-_OF_CAPTURE = "folder", "capture", "captured_at", "latitude", "longitude"
-_OF_INDEX = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
+_COLUMNS = (
+    *("folder", "capture", "captured_at", "latitude", "longitude"),
+    *("index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"),
+)
 
 
 def to_check(index: Index | None, unit: str, sidecar: Sidecar, run: RunFacts, label: str) -> str:
@@ -88,7 +90,7 @@ def update_table(
     result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
     if result or (out / INDICES_FILE).is_file():
         cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
-        write_csv(out / INDICES_FILE, (*_OF_CAPTURE, *_OF_INDEX), cells)
+        write_csv(out / INDICES_FILE, _COLUMNS, cells)
     return result
 
 
@@ -109,11 +111,12 @@ def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
 
 
 def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
-    """Return the cells of a row, among them those of all columns."""
+    """Return the cells of a row by column."""
     folder, capture, _ = row.key
     file = "" if row.path is None else row.path.relative_to(out).as_posix()
     others = {"folder": folder, "capture": capture, "input": row.statistics.unit, "file": file}
-    return vars(row) | row.statistics.as_json() | others
+    known = vars(row) | row.statistics.as_json() | others
+    return {column: known[column] for column in _COLUMNS}
 
 
 def _report_of_row(cells: Mapping[str, str], out: Path) -> IndexReport:
