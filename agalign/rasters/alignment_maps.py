@@ -1,6 +1,6 @@
 """Rasters of the expected alignment error, of quality flags and of the relief, on the grid of the aligned files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -188,9 +188,8 @@ class ReliefMap(Product):
         relief = relief_of(context.with_pixels)
         if relief is None:
             return []
-        layers = relief_layers(context.capture, context.with_pixels, relief, context.grid)
-        if not context.settings.write.relief_map:
-            layers = {"parallax": layers["parallax"]}
+        names = RELIEF_UNITS if context.settings.write.relief_map else ("parallax",)
+        layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, names=names)
         descriptions = [LayerDescription(name, RELIEF_UNITS[name]) for name in layers]
         blocks = ((values, index, 0, 0) for index, values in enumerate(layers.values(), start=1))
         return self.write_layers(context, descriptions, blocks)
@@ -202,9 +201,12 @@ def relief_layers(
     relief: Relief,
     grid: OutputGrid,
     size_px: tuple[int, int] | None = None,
+    *,
+    names: Collection[str] = RELIEF_UNITS,
 ) -> dict[str, NDArray[np.float32]]:
-    """Return layers (height, width) on a grid: `parallax` in px of the reference's file along a baseline of length 1,
-    `confidence` from 0 to 1, and `range` in metres along the optical axis, nan where it is unknown.
+    """Return layers (height, width) on a grid, those of these names: `parallax` in px of the reference's file along a
+    baseline of length 1, `confidence` from 0 to 1, and `range` in metres along the optical axis, nan where it is
+    unknown.
 
     With `size_px` (width, height) the same area is sampled at that size.
     """
@@ -212,12 +214,12 @@ def relief_layers(
     x, y = np.meshgrid(np.linspace(0, grid.width - 1, columns), np.linspace(0, grid.height - 1, rows))
     points = grid.reference_positions(np.stack([x, y], axis=-1), capture.reference.lens)
     parallax_px = relief(points)
-    confidence = Relief(relief.confidence, relief.confidence, relief.scale)(points)
-    return {
-        "parallax": rounded(parallax_px),
-        "confidence": rounded(confidence),
-        "range": _range_m(capture, alignments, points, parallax_px),
+    layers: dict[str, Callable[[], NDArray[np.float32]]] = {
+        "parallax": lambda: rounded(parallax_px),
+        "confidence": lambda: rounded(Relief(relief.confidence, relief.confidence, relief.scale)(points)),
+        "range": lambda: _range_m(capture, alignments, points, parallax_px),  # most of the time
     }
+    return {name: layers[name]() for name in names}
 
 
 def _range_m(

@@ -84,7 +84,8 @@ def _relief_of(context: ProductContext) -> ReliefTile | None:
         return None
     reduction = max(1.0, max(context.grid.width, context.grid.height) / _MAX_TILE_PX)
     size_px = reduced_size_px((context.grid.width, context.grid.height), reduction)
-    layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, size_px)
+    names = "parallax", "range"
+    layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, size_px, names=names)
     range_m = layers["range"][np.isfinite(layers["range"])]
     limits_m = tuple(np.percentile(range_m, _RELIEF_PERCENTILES).tolist()) if range_m.size else None
     return relief_tile(layers["parallax"], limits_m)

@@ -155,6 +155,19 @@ def test_the_raster_of_the_relief(run: Run, written: Path) -> None:
     assert (product.file, product.bytes) == (path.name, path.stat().st_size)
 
 
+def test_the_range_is_calculated_on_request(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes most of the time; the preview states its limits."""
+    sizes = list[tuple[int, ...]]()
+
+    def range_m(_capture: Capture, _alignments: object, _points: object, parallax_px: np.ndarray) -> np.ndarray:
+        sizes.append(parallax_px.shape)
+        return np.full(parallax_px.shape, 7.0, np.float32)
+
+    monkeypatch.setattr("agalign.rasters.alignment_maps._range_m", range_m)
+    assert set(layers_of(run.write(tmp_path))) == {"parallax"}
+    assert sizes == [SIZE[::-1]]
+
+
 def test_without_places_of_lenses_there_is_no_range(run: Run) -> None:
     unknown = replace(run.capture, bands=tuple(replace(b, lens_offset=None) for b in run.capture.bands))
     layers = relief_layers(unknown, run.alignments, run.relief, OutputGrid(0, 0, *SIZE))
