@@ -27,7 +27,7 @@ from pathlib import Path
 sdist, wheel = sys.argv[1:]
 stem = Path(sdist).name.removesuffix(".tar.gz")
 package = {p.as_posix() for p in Path("agalign").rglob("*") if p.is_file() and "__pycache__" not in p.parts}
-for name in ("py.typed", "report/page.html.j2", "report/page.js", "method/starter.safetensors"):
+for name in ("py.typed", "report/page/page.html.j2", "report/page/page.css", "report/page/start.js", "method/starter.safetensors"):
     assert f"agalign/{name}" in package, name
 facts = {f"{stem}.dist-info/{n}" for n in ("METADATA", "WHEEL", "RECORD", "entry_points.txt", "licenses/LICENSE")}
 held = set(zipfile.ZipFile(wheel).namelist())

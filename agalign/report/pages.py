@@ -41,6 +41,23 @@ _MAX_LISTED = 100
 _MAX_EXCLUDED = 20
 """Captures of panels, and of the sky, with a table in the page; OUT/panels.json and OUT/sky.json have all."""
 
+SCRIPTS = (
+    "data.js",
+    "elements.js",
+    "texts.js",
+    "colours.js",
+    "table.js",
+    "map.js",
+    "capture.js",
+    "viewer.js",
+    "navigation.js",
+    "sheet.js",
+    "overlays.js",
+    "painting.js",
+    "start.js",
+)
+"""The files of the script of the page, in their order."""
+
 
 def write_pages(out: Path, on_problem: Callable[[str], object]) -> FlightFacts:
     """Write OUT/index.html with OUT/report-data, OUT/summary.csv, OUT/indices.csv and OUT/flight.geojson from all
@@ -177,7 +194,9 @@ def pages_exist(out: Path) -> bool:
 
 def _page(**values: Any) -> str:
     """The page of the template, which gets these values and those of every page."""
-    style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
+    files = resources.files(__package__) / "page"
+    style = (files / "page.css").read_text("utf-8")
+    script = "".join((files / name).read_text("utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     of_every_page = {
         "version": __version__,
@@ -194,7 +213,7 @@ def _page(**values: Any) -> str:
 def _template() -> Template:
     """The template of the page."""
     environment = Environment(
-        loader=PackageLoader(__package__, "."),
+        loader=PackageLoader(__package__, "page"),
         autoescape=select_autoescape(["j2"]),
         trim_blocks=True,
         lstrip_blocks=True,

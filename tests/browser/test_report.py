@@ -279,8 +279,8 @@ def test_pictures_in_stops_are_exact(viewer: Any) -> None:
           [grey.width, grey.height] = [256, 8];
           const pen = grey.getContext("2d");
           for (let v = 0; v < 256; v += 1) { pen.fillStyle = `rgb(${v} ${v} ${v})`; pen.fillRect(v, 0, 1, 8); }
-          window.made = [facts.index_colours, facts.index_greys, [FAR, NEAR]].map((stops) => {
-            const made = inStops(grey, [0, 0, 256, 8], stops).getContext("2d").getImageData(0, 4, 256, 1).data;
+          window.made = [facts.index_colours, facts.index_greys, PARALLAX_STOPS].map((stops) => {
+            const made = colourGrey(grey, [0, 0, 256, 8], stops).getContext("2d").getImageData(0, 4, 256, 1).data;
             const wanted = [...Array(256).keys()].map((v) => {
               const at = v / 255 * (stops.length - 1);
               const k = Math.min(stops.length - 2, Math.floor(at));
@@ -453,7 +453,7 @@ def test_a_season_is_loaded_in_parts(browser: Any, out: Path, tmp_path: Path, mo
 
 def test_the_table_has_pages(page: Any) -> None:
     page.evaluate(
-        "() => { for (let i = 0; i < 450; i += 1) captures.push({ ...captures[0], label: `z${i}` }); tableBody(); }"
+        "() => { for (let i = 0; i < 450; i += 1) captures.push({ ...captures[0], label: `z${i}` }); showRows(); }"
     )
     rows = page.locator("#table tbody tr")
     assert (rows.count(), page.locator("#table-pages").inner_text()) == (200, "Earlier rows\nLater rows\n1 to 200")

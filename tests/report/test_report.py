@@ -27,7 +27,7 @@ from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.report import facts as facts_module
 from agalign.report.charts import CHART_HEIGHT, drifts_of, hues_of, rig_views
 from agalign.report.facts import CameraOffsets
-from agalign.report.pages import pages_exist, write_pages
+from agalign.report.pages import SCRIPTS, pages_exist, write_pages
 from agalign.report.pair_totals import PairTotals
 from agalign.report.terms import DOC_PAGES, TERMS
 from agalign.spectral_indices.indices_csv import update_table
@@ -39,7 +39,7 @@ from ..conftest import read_json, save_known_model, seeded, textured_image
 from ..records.test_sidecar import ALIGNED, NIR, example
 from ..run_outputs import change, facts_of, table_in
 
-PAGE = Path(agalign.__file__).parent / "report"
+PAGE = Path(agalign.__file__).parent / "report" / "page"
 
 
 @pytest.fixture
@@ -281,14 +281,13 @@ def test_indices_that_were_not_written_are_named_with_the_reason(out: Path, monk
 def test_each_term_of_a_column_is_explained_in_the_help(out: Path) -> None:
     write_pages(out, pytest.fail)
     page = (out / "index.html").read_text(encoding="utf-8")
-    script = (PAGE / "page.js").read_text(encoding="utf-8")
+    script = "".join(path.read_text(encoding="utf-8") for path in PAGE.glob("*.js"))
     assert '<a href="#help">' in page.partition("</header>")[0]
     assert 'id="help"' in page
     heads = re.findall(r'<th scope="col"[^>]* title="([^"]+)">', page)
     assert len(heads) >= 6
     assert {unescape(head) for head in heads} <= {term.meaning for term in TERMS.values()}
-    used = set(re.findall(r'\["[^"\]]+", "(\w+)"\]', script.partition("const heads = [\n")[2].partition("];")[0]))
-    used |= set(re.findall(r'term: "(\w+)"', script))
+    used = set(re.findall(r'term: "(\w+)"', script))
     assert used <= set(TERMS)
     assert len(used) >= 8
     for name in TERMS:
@@ -519,13 +518,18 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     assert drifts_of({"camera": CameraOffsets(captures[:2])}) == []
 
 
+def test_the_page_has_all_scripts() -> None:
+    assert sorted(SCRIPTS) == sorted(path.name for path in PAGE.glob("*.js"))
+
+
 @pytest.mark.slow
 def test_the_scripts_types_are_right() -> None:
     tsc = shutil.which("tsc")
     if tsc is None:
         pytest.skip("TypeScript is not installed")
     options = "--allowJs --checkJs --noEmit --strict --skipLibCheck --target es2022 --lib es2022,dom,dom.iterable"
-    done = subprocess.run([tsc, *options.split(), str(PAGE / "page.js")], capture_output=True, text=True, check=False)
+    scripts = sorted(map(str, PAGE.glob("*.js")))
+    done = subprocess.run([tsc, *options.split(), *scripts], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 
 
