@@ -10,13 +10,12 @@
 /**
  * @typedef {{error_px: number | null, error_band_px: number | null}} ExpectedError
  *   `error_px` is in px of the reference; `error_band_px` is null if the pixels of the band have the same size.
- * @typedef {{from: string, std_px: number, off_px: number | null}} Prediction
  * @typedef {{kind: string, held_out_p95_px: Record<string, number | null>}} Geometry
  * @typedef {ExpectedError & {band: string, wavelength_nm: number | null, status: string, reason: string | null, seed: string | null,
  *   seconds: number, written: boolean, offset_px: [number, number] | null, offset_length_px: number | null,
  *   residual_px: number | null, residual_p95_px: number | null, usable: boolean, over_1_px: number | null,
  *   coverage: number | null, retrieval: number | null, similarity: Record<string, [number | null, number | null]> | null,
- *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, check: string[], lattice: number,
+ *   prediction: {from: string} | null, geometry: Geometry | null, occluded: number | null, check: string[], lattice: number,
  *   shifts: (number | null)[]}} Pair A band and its alignment to the reference; also the reference itself.
  * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number, masked: number,
  *   span: [number, number], unit: string, raw: boolean, file: string, picture: string}} Index
