@@ -513,6 +513,21 @@ def test_the_map_leads_to_the_captures(page: Any) -> None:
     assert -1 < first["properties"]["ndvi_median"] < 1
 
 
+def test_a_missing_preview_stays_announced(browser: Any, out: Path, tmp_path: Path) -> None:
+    shutil.copy(out / "0000SET" / "000" / "IMG_0001.json", tmp_path)
+    write_pages(tmp_path, lambda _: None)
+    page = opened(browser, tmp_path)
+    page.wait_for_function("() => document.querySelector('#tag-right').textContent === 'the preview is not there'")
+    page.get_by_role("button", name="Side by side").click()
+    assert page.locator("#tag-right").inner_text() == "the preview is not there"
+    page.close()
+
+
+def test_the_open_capture_stays_marked_when_the_map_is_drawn_again(viewer: Any) -> None:
+    viewer.evaluate("drawMap()")
+    assert viewer.locator("#map circle.open title").all_text_contents() == ["0000SET/000/IMG_0001"]
+
+
 def test_next_and_previous_follow_the_table(viewer: Any) -> None:
     viewer.get_by_role("button", name="Next").click()
     viewer.wait_for_function("() => document.querySelector('#capture-title').textContent.includes('IMG_0002')")
