@@ -528,6 +528,22 @@ def test_the_open_capture_stays_marked_when_the_map_is_drawn_again(viewer: Any) 
     assert viewer.locator("#map circle.open title").all_text_contents() == ["0000SET/000/IMG_0001"]
 
 
+def test_a_map_begins_at_one_place(browser: Any, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The captures in the page are at one place, those that are loaded later are not."""
+    monkeypatch.setattr(facts, "_ROWS_PER_PART", 2)
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    for number in range(4):
+        position = sidecar["position"] | {"latitude": 52 + 1e-4 * max(0, number - 1)}
+        (tmp_path / f"{number}.json").write_text(json.dumps(sidecar | {"capture": str(number), "position": position}))
+    write_pages(tmp_path, lambda _: None)
+    page = opened(browser, tmp_path)
+    page.wait_for_function("() => document.querySelector('#count').textContent === '4 of 4 shown'")
+    assert page.locator("#map circle").count() == 4
+    assert page.locator("#map-legend").is_visible()
+    assert page.locator("#map-colour").is_visible()
+    page.close()
+
+
 def test_next_and_previous_follow_the_table(viewer: Any) -> None:
     viewer.get_by_role("button", name="Next").click()
     viewer.wait_for_function("() => document.querySelector('#capture-title').textContent.includes('IMG_0002')")

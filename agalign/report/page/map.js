@@ -16,9 +16,10 @@ function drawMap() {
   const placed = captures.filter((row) => row.position !== null).sort((a, b) => a.captured_at.localeCompare(b.captured_at));
   if (!placed.length) return;
   const { metres, reach, centre } = inMetres(placed);
-  if (Math.max(...reach) < ONE_PLACE_M) {
+  const isOnePlace = Math.max(...reach) < ONE_PLACE_M;
+  byId("map").querySelectorAll("label, #map-legend").forEach((part) => { part.toggleAttribute("hidden", isOnePlace); });
+  if (isOnePlace) {
     place.replaceChildren(el("p", {}, `All at ${centre.map((v) => v.toFixed(6)).join(", ")}.`));
-    byId("map").querySelectorAll("label, #map-legend").forEach((part) => { part.remove(); });
     return;
   }
   const width = clamp(place.clientWidth, 300, MAP.width);
