@@ -544,6 +544,17 @@ def test_a_map_begins_at_one_place(browser: Any, out: Path, tmp_path: Path, monk
     page.close()
 
 
+def test_a_capture_of_its_reference_alone_is_shown(browser: Any, out: Path, tmp_path: Path) -> None:
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    bands = [band for band in sidecar["bands"] if band["status"] == "reference"]
+    sidecar |= {"bands": bands, "missing_bands": ["NIR"], "status": "degraded"}
+    (tmp_path / "IMG_0001.json").write_text(json.dumps(sidecar))
+    write_pages(tmp_path, lambda _: None)
+    page = opened(browser, tmp_path)
+    assert "Green as red, green, blue" in page.locator("#over-note").inner_text(timeout=3000)
+    page.close()
+
+
 def test_next_and_previous_follow_the_table(viewer: Any) -> None:
     viewer.get_by_role("button", name="Next").click()
     viewer.wait_for_function("() => document.querySelector('#capture-title').textContent.includes('IMG_0002')")
