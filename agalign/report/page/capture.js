@@ -2,7 +2,8 @@
  * The capture that is open: its heading, and what became of its bands in words and in numbers.
  */
 
-const opened = { /** @type {Row | null} */ row: null, /** @type {Capture | null} */ capture: null, /** @type {Details | null} */ part: null };
+/** @type {{row: Row | null, capture: Capture | null, part: Details | null}} */
+const opened = { row: null, capture: null, part: null };
 /** The row whose details are being loaded, or are open. @type {Row | null} */
 let wantedRow = null;
 

@@ -6,8 +6,9 @@ const LARGEST_ZOOM = 40;
 const ZOOM_STEP = 1.6;
 const GRAB_PX = 18; // from the line between before and after
 
-/** @param {number} factor @param {Point} [about] In shares of what is seen. */
-function zoomBy(factor, [x, y] = [0.5, 0.5]) {
+/** @param {number} factor @param {Point} about In shares of what is seen. */
+function zoomBy(factor, about = [0.5, 0.5]) {
+  const [x, y] = about;
   const zoom = clamp(view.zoom * factor, 1, LARGEST_ZOOM);
   showPart(zoom, view.x + x / view.zoom - x / zoom, view.y + y / view.zoom - y / zoom);
 }

@@ -5,8 +5,8 @@
 
 const CHANNELS = ["#f00", "#0f0", "#00f"];
 const WHITE = [255, 255, 255];
-/** Of the capture that is open. */
-const pictures = { /** @type {Record<string, HTMLCanvasElement>} */ made: {}, /** @type {Record<string, HTMLImageElement>} */ loaded: {} };
+/** @type {{made: Record<string, HTMLCanvasElement>, loaded: Record<string, HTMLImageElement>}} Of the capture that is open. */
+const pictures = { made: {}, loaded: {} };
 
 function forgetPictures() {
   pictures.made = {};

@@ -43,9 +43,9 @@ function presets(capture) {
   const find = (low, high, name) =>
     (capture.bands.find((b) => b.wavelength_nm !== null && b.wavelength_nm >= low && b.wavelength_nm < high) ?? capture.bands.find((b) => b.wavelength_nm === null && name.test(b.band)))?.band;
   const [blue, green, red, nir, edge] = [find(430, 495, /^blue/i), find(520, 585, /^green/i), find(620, 690, /^red$/i), find(760, 1000, /^nir/i), find(695, 755, /red ?edge/i)];
-  const [first = capture.reference, second = first] = movingBands(capture).map((b) => b.band);
+  const [first, second] = movingBands(capture).map((b) => b.band);
   /** @type {[string, (string | undefined)[]][]} */
-  const known = [["false colour", [nir, red, green]], ["true colour", [red, green, blue]], ["red edge", [nir, edge, green]], ["first bands", [first, second, capture.reference]]];
+  const known = [["false colour", [nir, red, green]], ["true colour", [red, green, blue]], ["red edge", [nir, edge, green]], ["first bands", [first ?? capture.reference, second ?? first ?? capture.reference, capture.reference]]];
   return known.flatMap(([name, bands]) => (bands.every((b) => b !== undefined) ? [{ name, bands: /** @type {Composite} */ (bands) }] : []));
 }
 
