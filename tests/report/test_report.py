@@ -527,6 +527,9 @@ def test_the_scripts_types_are_right() -> None:
     tsc = shutil.which("tsc")
     if tsc is None:
         pytest.skip("TypeScript is not installed")
+    version = subprocess.run([tsc, "--version"], capture_output=True, text=True, check=True).stdout
+    if "Version 4." in version:
+        pytest.skip("TypeScript 4 ignores tags after a sentence")
     options = "--allowJs --checkJs --noEmit --strict --skipLibCheck --target es2022 --lib es2022,dom,dom.iterable"
     scripts = sorted(map(str, PAGE.glob("*.js")))
     done = subprocess.run([tsc, *options.split(), *scripts], capture_output=True, text=True, check=False)
