@@ -107,7 +107,8 @@ class Parallax:
         """The same with the pixels hidden where a nearer one, of larger parallax, is displaced to the same position.
 
         Surfaces that are displaced by less than `min_width_px` relative to each other do not hide one another. Gaps
-        between hidden pixels are closed, and then areas smaller than `min_area_px` are not hidden.
+        between hidden pixels are closed, and then areas smaller than `min_area_px` are not hidden. These are px of the
+        raster: on a larger one, smaller parts of the scene are hidden.
         """
         min_width_px = 1.5  # smaller differences of parallax are slopes of one surface, or noise
         min_area_px = 16  # smaller areas are single pixels with wrong parallax
