@@ -48,7 +48,7 @@ def _one_of_each_band(given: tuple[tuple[str, float], ...]) -> tuple[tuple[str, 
     """Return reflectances of the panel. Raises ConfigurationError for two of a band."""
     keys = [band_key(name) for name, _ in given]
     if repeated := [name for number, (name, _) in enumerate(given) if keys[number] in keys[:number]]:
-        raise ConfigurationError(f"--panel-albedo: has two reflectances of {repeated[0] or 'all bands'}")
+        raise ConfigurationError(f"--panel-albedo has two reflectances of {repeated[0] or 'all bands'}")
     return given
 
 
