@@ -445,6 +445,10 @@ def test_a_season_is_loaded_in_parts(browser: Any, out: Path, tmp_path: Path, mo
     assert [name.rpartition("-")[0] for name in loaded if name.endswith(".js")] == ["rows-2", "rows-3", "details-6"]
     choose(page, "Overlay", "vectors")
     look_at(page, "IMG_0003")
+    cut = browser.new_page()
+    cut.goto((tmp_path / "index.html").as_uri() + "#capture=IMG%2")
+    cut.wait_for_function("() => document.querySelector('#count').textContent === '12 of 12 shown'", timeout=5000)
+    cut.close()
     shutil.rmtree(tmp_path / "report-data")
     page.reload()
     page.wait_for_function("() => document.querySelector('#count').textContent.includes('copy the folder report-data')")

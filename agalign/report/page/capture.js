@@ -62,7 +62,13 @@ function openCapture(row, onShown = () => {}) {
 
 /** The label of a capture in the address of the page; null without one. */
 function labelInHash() {
-  return location.hash.startsWith(HASH) ? decodeURIComponent(location.hash.slice(HASH.length)) : null;
+  if (!location.hash.startsWith(HASH)) return null;
+  const label = location.hash.slice(HASH.length);
+  try {
+    return decodeURIComponent(label);
+  } catch {
+    return label; // the address was cut within a character
+  }
 }
 
 /** Show the capture of the address, if it is known, and scroll to it. */
