@@ -123,10 +123,11 @@ class Adjustment:
 def adjust(
     windows: WindowShifts, size_px: tuple[int, int], layout: Array | None = None, lens_std_px: Array | None = None
 ) -> Adjustment | None:
-    """Fit the model to the windows of a capture; None if too few windows are measured in all bands.
+    """Fit the model to the windows of a capture; None if the baselines are unknown.
 
     `size_px` is (width, height) of the reference. `layout` (bands, 2) are the known directions, in any unit, in which
     points move in the bands when the scene comes nearer; they initialise the baselines and determine their sign.
+    Without a layout, two windows for each band that are measured in all bands initialise them.
     Lens shapes are fitted with the standard deviations `lens_std_px` (4,).
     """
     initial = _initial_baselines(windows) if layout is None else layout
