@@ -59,7 +59,7 @@ function cutOut(image, place) {
 }
 
 /**
- * A canvas from pictures in a row of the sheet, made when it is first needed; null where there is no such row.
+ * Draw pictures from a row of the sheet on a canvas, once; null if the sheet is not loaded or has no such row.
  * @param {Preview} preview @param {string} line @param {number[]} columns
  * @param {(sheet: HTMLImageElement, places: Rectangle[]) => HTMLCanvasElement} make
  */
