@@ -214,7 +214,8 @@ class CaptureEstimation:
 
     def _fit_windows(self, result: Alignments) -> Alignments:
         """Estimate bands by windows without descriptors where these have no result; return the alignments then."""
-        lost = [self.bands[name] for name, a in result.items() if not a.is_usable(DELIVERED_STD_PX)]
+        unusable = {name for name, alignment in result.items() if not alignment.is_usable(DELIVERED_STD_PX)}
+        lost = [band for name, band in self.bands.items() if name in unusable - self._under_each_relief]
         if not (lost and self._may_be_homography):
             return result
         by_windows = {band.pair.name: refined for band in lost if (refined := fitted_to_windows(band)) is not None}
@@ -292,11 +293,10 @@ class CaptureEstimation:
         self.progress(next(iter(results)), "relief", 0.0)  # with the name of the first band
         reliefs, along_a_line = by_relief(combined, use, is_observation=self.is_observation)
         self.reliefs += reliefs
-        under = set.intersection(*map(set, self.reliefs)) if self.reliefs else set()  # whichever of them is chosen
         new = {*results} | {name for name, band in self.bands.items() if not band.candidates}
         for refined in combined:
             name = refined.pair.name
-            if name in new - under and self.bands[name].issue is None:
+            if name in new - self._under_each_relief and self.bands[name].issue is None:
                 self.progress(name, "checking", 0.0)
                 field_use = "never" if self.is_observation or name in along_a_line else use
                 self.bands[name].candidates += refined.candidates(field_use)
@@ -306,6 +306,11 @@ class CaptureEstimation:
         if not self._may_be_homography:  # as the MAP estimate is
             return self.refined
         return with_map_estimates(self.refined, None if self.model is None else self.model.rig, self.capture)
+
+    @property
+    def _under_each_relief(self) -> set[str]:
+        """The bands that get a candidate under a relief, whichever relief is chosen: they need no others."""
+        return set.intersection(*map(set, self.reliefs)) if self.reliefs else set()
 
     @property
     def refined(self) -> list[RefinedBand]:

@@ -19,7 +19,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Seed
 from agalign.values.issues import FOLDS, OTHER_GEOMETRY, RETRIEVAL, UNREADABLE, Issue
 
-from ..builders import fitted_to_windows, joint_result, pair_of, rms, two_views, whole
+from ..builders import estimation_of, fitted_to_windows, joint_result, pair_of, rms, two_views, whole
 from ..conftest import textured_image
 
 SIZE = 640, 480
@@ -77,6 +77,23 @@ def test_windows_are_fitted_where_descriptors_predict_with_an_error_that_no_inde
     band = BandCandidates(pair, SEED, candidates=[Candidate.of(warped, joint_result(TRUTH, std_px=std_px))])
     assert fitted_to_windows(band).status == "predicted"
     assert bool(fitted) is is_fitted
+
+
+@pytest.mark.parametrize("in_second", [True, False])
+def test_windows_are_not_fitted_for_bands_under_each_relief(
+    pair: BandPair, in_second: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The candidate under the relief is chosen before any other: the result of the descriptors remains."""
+    fitted: list[BandCandidates] = []
+    monkeypatch.setattr(align_bands, "fitted_to_windows", fitted.append)
+    result = joint_result(TRUTH, std_px=4.0)
+    refined = RefinedBand.of(pair, SEED, result)
+    estimation = estimation_of(BandCandidates(pair, SEED, candidates=[Candidate.of(refined.warped, result)]), refined)
+    under = {pair.name: Candidate.of(refined.warped, result)}
+    estimation.reliefs = [under, under if in_second else {}]
+    estimation._fit_windows(estimation.decided())
+    assert bool(fitted) is not in_second
+    assert estimation.refined == [refined]
 
 
 def test_held_out_windows_must_confirm_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
