@@ -31,7 +31,8 @@ _LATTICE_PX = 24
 _CAUCHY_SCALES = 4.0
 """Residual at which the robust weight is one half, in residual scales: only wrong peaks have larger ones."""
 MIN_WINDOWS = 24
-"""Minimum number of windows with a shift for a field or a relief; a fit without one fold may have half as many."""
+"""Minimum number of windows with a shift for a field, for a relief, and in a band for a test of common parallax; a fit
+without one fold may have half as many."""
 _NOISE_PX = 0.12
 """Noise of a window with weight 1: half of the windows of sharp images have less."""
 _SMOOTHNESS = 0.4

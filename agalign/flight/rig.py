@@ -46,7 +46,8 @@ _COLUMNS: Mapping[Factor, tuple[int, ...]] = {
     "reference": (3, 4),  # a motion of all moving bands relative to the reference
 }
 MIN_CAPTURES = 3
-"""Fewer captures agree by chance too often."""
+"""Fewer captures agree by chance too often: for a rig, for the variation of a factor over the flight, and for the
+rectangle of a flight."""
 FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 """Standard deviations of the prior of a capture's factors (5,); wide, to allow heights outside the learned range."""
 MIN_STD_PX = 0.05
