@@ -10,15 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from agalign.errors import InputError, Reason, SidecarError
-from agalign.host.files import (
-    RUN_FILE,
-    compact_lists,
-    file_checksum,
-    folders_of_run,
-    open_regular,
-    read_regular,
-    write_text,
-)
+from agalign.host.files import RUN_FILE, file_checksum, folders_of_run, indented, open_regular, read_regular, write_text
 from agalign.host.text import shortened
 from agalign.records.listed_files import ListedFiles, file_problem
 from agalign.records.sidecar import SCHEMA, FilePart, Sidecar
@@ -37,9 +29,9 @@ def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
     Raises OutputError, and SidecarError for values that no sidecar can have.
     """
     checksum = content_checksum(sidecar.model_dump_json(by_alias=True))
-    text = sidecar.model_copy(update={"checksum": checksum}).model_dump_json(by_alias=True, indent=1)
+    text = sidecar.model_copy(update={"checksum": checksum}).model_dump_json(by_alias=True)
     in_file = _parsed(path, text.encode())
-    write_text(path, compact_lists(text))
+    write_text(path, indented(text))
     return in_file
 
 

@@ -1,8 +1,11 @@
 """Samples of a complete mapping, from which others interpolate it without knowing its lens models."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.spatial import Delaunay
 
 from agalign.values import geometry
 from agalign.values.geometry import Points
@@ -25,15 +28,22 @@ def sampled_mapping(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
     if min(size_px) == 1:
         return points_px  # points on one line have no triangles
     for columns, rows in _GRIDS:
-        points_px = _pixel_lattice(size_px, columns, rows)
+        triangles = _triangles(size_px, columns, rows)
+        points_px = triangles.points
         # The midpoints alone, as the error is 0 at the points themselves.
         between_px = geometry.lattice(*size_px, 2 * columns - 1, 2 * rows - 1).reshape(2 * rows - 1, -1, 2)[1::2, 1::2]
-        interpolated = CloughTocher2DInterpolator(points_px, mapping(points_px))
+        interpolated = CloughTocher2DInterpolator(triangles, mapping(points_px))
         error_px = np.abs(interpolated(between_px) - mapping(between_px))
         # Rounding moves some points at the border outside of the triangles: NaN.
         if np.nanpercentile(error_px, _INTERPOLATION_PERCENTILE) <= _MAX_INTERPOLATION_ERROR_PX:
             break
     return points_px
+
+
+@lru_cache(maxsize=len(_GRIDS))
+def _triangles(size_px: tuple[int, int], columns: int, rows: int) -> Delaunay:
+    """Triangulate the points of a grid, which takes as long as the interpolation; all bands have the same points."""
+    return Delaunay(_pixel_lattice(size_px, columns, rows))
 
 
 def _pixel_lattice(size_px: tuple[int, int], columns: int, rows: int) -> Points:

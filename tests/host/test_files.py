@@ -1,4 +1,5 @@
 import errno
+import json
 import os
 import stat
 import subprocess
@@ -13,6 +14,7 @@ from agalign.errors import OutputError
 from agalign.host.files import (
     RUN_FILE,
     complete_file,
+    indented,
     is_inside,
     read_regular,
     remove_partial_files,
@@ -147,3 +149,32 @@ def test_partial_files_of_this_run_alone_are_removed(tmp_path: Path) -> None:
     assert {p for p in tmp_path.rglob("*") if p.is_file()} == kept
     remove_partial_files(run)
     assert not (run / partial.name).exists()
+
+
+def test_indented_json_has_lists_of_numbers_on_one_line() -> None:
+    value = {
+        "numbers": [[1.5, -2], [None, True]],
+        "texts": ["a, [b]: {c}", 'say "d\\"'],
+        "none": [[], {}],
+        "of": [{"x": 1}],
+    }
+    text = indented(json.dumps(value, separators=(",", ":")))
+    assert json.loads(text) == value
+    assert text.split("\n") == [
+        "{",
+        ' "numbers": [[1.5,-2],[null,true]],',
+        ' "texts": [',
+        '  "a, [b]: {c}",',
+        r'  "say \"d\\\""',
+        " ],",
+        ' "none": [',
+        "  [],",
+        "  {}",
+        " ],",
+        ' "of": [',
+        "  {",
+        '   "x": 1',
+        "  }",
+        " ]",
+        "}",
+    ]
