@@ -24,6 +24,7 @@ from agalign.values.radiometric_errors import FACTORY_CALIBRATION, NO_VIGNETTING
 from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 NAMESPACE = "micasense.com/MicaSense"
+CALIBRATION = NAMESPACE, "RadiometricCalibration"
 _SENSITIVITY = pix4d.NAMESPACE, "BandSensitivity"
 _COEFFICIENT_BY_SENSITIVITY = 3.8079e-5
 """Product of the first coefficient of RadiometricCalibration and BandSensitivity, in 60 files of five RedEdge."""
@@ -79,7 +80,7 @@ class MicaSense(Camera):
 
     def contradictions(self, tags: Tags) -> Iterator[str]:
         """Compare what firmware writes twice: coefficient and sensitivity, black level and dark rows, wavelengths."""
-        a, sensitivity = tags.numbers(NAMESPACE, "RadiometricCalibration", 3), tags.number(*_SENSITIVITY)
+        a, sensitivity = tags.numbers(*CALIBRATION, 3), tags.number(*_SENSITIVITY)
         is_known = bool(re.fullmatch(r"RedEdge(?!-P).*", tags.model)) and len(a) == 3 and bool(sensitivity)
         if is_known and not agreed((a[0] * (sensitivity or 0.0), _COEFFICIENT_BY_SENSITIVITY))[1]:
             yield f"its RadiometricCalibration {a[0]:g} and BandSensitivity {sensitivity:g} contradict each other"
@@ -100,6 +101,19 @@ class MicaSense(Camera):
         return sun_by_sensor(tags)
 
 
+def calibration_on_rows(tags: Tags, rows: pix4d.GridRows) -> tuple[float, float, float] | None:
+    """Return RadiometricCalibration for pixels on other rows, where 1 + a2 y / t - a3 y is that of the band's own row
+    up to a factor, which a1 contains; None if a tag is missing.
+    """
+    a, exposure_s = tags.numbers(*CALIBRATION, 3), finite(tags.exif.get("ExposureTime"))
+    if len(a) != 3 or not exposure_s:
+        return None
+    at_first_row = 1 + (a[1] / exposure_s - a[2]) * rows.first
+    if not at_first_row > 0:
+        return None
+    return a[0] / at_first_row, a[1] * rows.step / at_first_row, a[2] * rows.step / at_first_row
+
+
 def _iso(tags: Tags) -> float | None:
     return finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
 
@@ -115,7 +129,7 @@ def _with_radiometry(band: Band, tags: Tags) -> Band:
         return replace(band, radiometry=centikelvin)
     light = irradiance(tags)
     band = replace(band, implausible=light.problem)
-    a, exposure_s = tags.numbers(NAMESPACE, "RadiometricCalibration", 3), finite(tags.exif.get("ExposureTime"))
+    a, exposure_s = tags.numbers(*CALIBRATION, 3), finite(tags.exif.get("ExposureTime"))
     black_level, iso = tags.black_level, _iso(tags)
     if len(a) != 3 or not exposure_s or black_level is None or not iso:
         has = {"RadiometricCalibration": len(a) == 3, "ExposureTime": exposure_s, "ISOSpeed": iso}

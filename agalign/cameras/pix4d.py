@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -181,6 +182,19 @@ class GridVignetting:
     coefficients: tuple[float, ...]
     error: float
     """p95 of its relative error."""
+
+
+class GridRows(NamedTuple):
+    """The rows of a band's file as a linear function of the rows of the output grid."""
+
+    first: float
+    """Row of the file at row 0 of the output."""
+    step: float
+    """Rows of the file per row of the output."""
+
+
+SAME_ROWS = GridRows(0.0, 1.0)
+"""Of an output with the rows of the file."""
 
 
 def vignetting(tags: Tags) -> tuple[tuple[float, float], tuple[float, ...]]:

@@ -12,7 +12,7 @@ from agalign.cameras import dji, dls, micasense, pix4d, tiff_directory
 from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags, finite, tags_of
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import GridVignetting
+from agalign.cameras.pix4d import SAME_ROWS, GridRows, GridVignetting
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Directory
 from agalign.cameras.xmp import Packet, names_in
 from agalign.values.capture import Band, is_clock_set
@@ -65,12 +65,18 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
 
 
 def band_tags(
-    source: Band, reference: Band, grid: OutputGrid, vignetting: GridVignetting | None, *, radiometry: bool = False
+    source: Band,
+    reference: Band,
+    grid: OutputGrid,
+    vignetting: GridVignetting | None,
+    rows: GridRows = SAME_ROWS,
+    *,
+    radiometry: bool = False,
 ) -> TransferredTags:
     """Return the tags for a file with aligned bands from the file, or the page, of `source`.
 
-    `vignetting` is that of the band; None if the pixels are corrected for it. With `radiometry` they are also corrected
-    for black level and exposure, and all their tags are left out.
+    `vignetting` and `rows` are those of the band; a vignetting of None is corrected in the pixels. With `radiometry`
+    they are also corrected for black level and exposure, and all their tags are left out.
     """
     own, of_reference = _directories(source), _directories(reference)
     black_level: set[int] = set() if radiometry else {Base.BlackLevelRepeatDim, Base.BlackLevel}
@@ -81,7 +87,7 @@ def band_tags(
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     packet.take(reference_packet, _GEOMETRY)
     _put_geometry(packet, reference, tags_of(of_reference), grid)
-    _put_radiometry(packet, tags_of(own), vignetting, radiometry=radiometry)
+    _put_radiometry(packet, tags_of(own), vignetting, rows, radiometry=radiometry)
     if serialised := packet.serialised():
         first[XMP] = tiff_directory.byte_string(serialised)
     exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], grid)
@@ -147,9 +153,11 @@ def _put_principal_point(packet: Packet, reference: Band, tags: Tags, grid: Outp
     packet.put((pix4d.NAMESPACE, "PrincipalPoint"), _texts(v / (density * grid.scale.mean) for v in point_px))
 
 
-def _put_radiometry(packet: Packet, tags: Tags, vignetting: GridVignetting | None, *, radiometry: bool) -> None:
-    """Replace the vignetting; `tags` are the band's own. None removes it, and `radiometry` also the other values that
-    have been applied to the pixels.
+def _put_radiometry(
+    packet: Packet, tags: Tags, vignetting: GridVignetting | None, rows: GridRows, *, radiometry: bool
+) -> None:
+    """Replace the vignetting and the row gradient; `tags` are the band's own. A vignetting of None is removed, and with
+    `radiometry` also the other values that have been applied to the pixels.
 
     The horizontal irradiance is added under the names that OpenDroneMap reads, with its unit.
     """
@@ -161,6 +169,8 @@ def _put_radiometry(packet: Packet, tags: Tags, vignetting: GridVignetting | Non
     else:
         packet.put((pix4d.NAMESPACE, "VignettingCenter"), _texts(vignetting.centre_px))
         packet.put((pix4d.NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
+    if (coefficients := micasense.calibration_on_rows(tags, rows)) is not None:
+        packet.put(micasense.CALIBRATION, _texts(coefficients))
     irradiance = dls.irradiance(tags).value if isinstance(camera_of(tags), micasense.MicaSense) else 0.0
     if irradiance > 0:
         for name, value in (("HorizontalIrradiance", irradiance), ("IrradianceScaleToSIUnits", 1.0)):

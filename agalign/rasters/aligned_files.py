@@ -18,7 +18,7 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.fill import fillnodata
 
 from agalign.cameras.metadata import read_tags
-from agalign.cameras.pix4d import GridVignetting, vignetting_of, vignetting_on_grid
+from agalign.cameras.pix4d import SAME_ROWS, GridRows, GridVignetting, vignetting_of, vignetting_on_grid
 from agalign.cameras.tag_transfer import TransferredTags, band_tags, capture_tags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
@@ -36,6 +36,7 @@ from agalign.rasters.product import CapturePaths, Product, ProductContext, Writt
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import Interpolation
+from agalign.values.geometry import Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.radiometry import Quantity, Radiometry
 from agalign.values.remedies import MISSING_BAND
@@ -88,7 +89,10 @@ class BandFiles(Product):
         for name, of_file in by_file.items():
             band, path = of_file[0].band, context.paths.folder / name
             vignetting = vignettings.get(band.name)
-            tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not context.is_raw)
+            rows = _rows(of_file[0], context.grid)
+            tags = band_tags(
+                band, context.capture.reference, context.grid, vignetting, rows, radiometry=not context.is_raw
+            )
             written.append(_written(self.kind, context, of_file, path, tags))
         return written
 
@@ -125,15 +129,31 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
 def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[str, GridVignetting]:
     """The vignetting of bands on the output grid; none for bands without its tags or without pixels."""
     result = {}
-    output_px = geometry.lattice(grid.width, grid.height, 25, 19)
     min_points = 30  # pixels of the lattice of 25 x 19 that must be inside a band: a polynomial has six coefficients
     for layer in layers:
         correction = _correction(layer.band)
-        positions_px = layer.positions(output_px, grid)
-        inside = is_inside(positions_px, layer.band)
-        if correction is not None and np.count_nonzero(inside) >= min_points:
-            result[layer.band.name] = vignetting_on_grid(correction, output_px[inside], positions_px[inside])
+        output_px, positions_px = _lattice(layer, grid)
+        if correction is not None and len(output_px) >= min_points:
+            result[layer.band.name] = vignetting_on_grid(correction, output_px, positions_px)
     return result
+
+
+def _rows(layer: Layer, grid: OutputGrid) -> GridRows:
+    """The rows of a band's file as a linear function of the rows of the output, by least squares."""
+    output_px, positions_px = _lattice(layer, grid)
+    y = output_px[:, 1]
+    if len(np.unique(y)) < 2:
+        return SAME_ROWS
+    step, first = np.polyfit(y, positions_px[:, 1], 1).tolist()
+    return GridRows(first, step)
+
+
+def _lattice(layer: Layer, grid: OutputGrid) -> tuple[Points, Points]:
+    """(pixels (n, 2) of the output inside a band, their positions in its file)."""
+    output_px = geometry.lattice(grid.width, grid.height, 25, 19)
+    positions_px = layer.positions(output_px, grid)
+    inside = is_inside(positions_px, layer.band)
+    return output_px[inside], positions_px[inside]
 
 
 def _correction(band: Band) -> Radiometry | None:

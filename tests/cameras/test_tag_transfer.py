@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import NAMESPACE, GridVignetting, vignetting_of
+from agalign.cameras.pix4d import NAMESPACE, GridRows, GridVignetting, vignetting_of
 from agalign.cameras.tag_transfer import _without_unset_clock, band_tags
 from agalign.cameras.tiff_directory import (
     EXIF,
@@ -57,7 +58,7 @@ def test_the_stack_has_the_tags_that_all_bands_share(aligned_flight: Path) -> No
 UNCHANGED = OutputGrid(0, 0, *SIZE)
 
 
-def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str = "out.tif", **options: bool) -> Path:
+def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str = "out.tif", **options: Any) -> Path:
     """Write a file with the tags of the source on a grid of the reference."""
     band = Band("reference", reference, 1, *SIZE, "uint16") if isinstance(reference, Path) else reference
     tags = band_tags(replace(band, path=source), band, grid, GridVignetting((80, 60), (1e-4,), 0), **options)
@@ -117,6 +118,23 @@ def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
         assert ((NAMESPACE, "VignettingCenter") in result.xmp) != radiometry
         assert ((MICASENSE, "RadiometricCalibration") in result.xmp) != radiometry
         assert (result.black_level is None) == radiometry
+
+
+def test_the_row_gradient_is_that_of_the_new_rows(tmp_path: Path) -> None:
+    """Row 10 of a file with twice as many rows, cropped, is row 45 of the band's own file."""
+    write_capture(tmp_path, VENDORS["RedEdge"])
+    values = {(NAMESPACE, "BandName"): ("NIR",), (MICASENSE, "RadiometricCalibration"): ("2e-4", "1e-7", "-5e-5")}
+    source, exposure_s = tmp_path / "IMG_0007_4.tif", 1e-3
+    tags = {XMP: byte_string(packet(values, "sequences"))}
+    add_directories(source, tags, {Base.ExposureTime: rational(exposure_s)}, {})
+    result = read_tags(transferred(source, tmp_path / "IMG_0007_2.tif", UNCHANGED, rows=GridRows(40.0, 0.5)))
+
+    def gain(a1: float, a2: float, a3: float, y: float) -> float:
+        return a1 / (1 + a2 * y / exposure_s - a3 * y)
+
+    coefficients = result.numbers(MICASENSE, "RadiometricCalibration", 3)
+    for row in (0, 10, 100):
+        assert gain(*coefficients, row) == pytest.approx(gain(2e-4, 1e-7, -5e-5, 40 + row / 2), rel=1e-6)
 
 
 def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:

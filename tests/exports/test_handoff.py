@@ -146,6 +146,12 @@ def test_bands_of_one_file_have_each_their_own_vignetting(monkeypatch: pytest.Mo
     assert [result[name].centre_px[0] for name in "ab"] == pytest.approx([243 - 3, 243 + 5])
 
 
+def test_rows_of_a_band_on_a_finer_and_cropped_grid() -> None:
+    band = Band("NIR", Path("nir.tif"), 1, 480, 360, "uint16")
+    layer = Layer(band, PixelMapping(np.array([[0.5, 0.0, 3.0], [0.0, 0.5, -2.0], [0.0, 0.0, 1.0]])))
+    assert aligned_files._rows(layer, OutputGrid(0, 60, 900, 600)) == pytest.approx((28.0, 0.5))
+
+
 # ---- tags of aligned bands
 
 
