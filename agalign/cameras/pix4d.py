@@ -203,14 +203,15 @@ def vignetting(tags: Tags) -> tuple[tuple[float, float], tuple[float, ...]]:
     return ((centre[0], centre[1]), k) if len(centre) == 2 and any(k) else ((0.0, 0.0), ())
 
 
-def vignetting_of(tags: Tags, size_px: tuple[int, int]) -> Radiometry | None:
+def vignetting_of(tags: Tags, size_px: tuple[int, int], *, divides: bool = True) -> Radiometry | None:
     """Return the correction of the vignetting alone, of values above the black level, by Camera:VignettingCenter and
-    VignettingPolynomial of a band of (width, height); None if they are missing or damaged.
+    VignettingPolynomial of a band of (width, height), which `divides` the values or else multiplies them; None if they
+    are missing or damaged.
     """
     centre, k = vignetting(tags)
     if not k or not all(0 <= c <= size for c, size in zip(centre, size_px, strict=True)):
         return None
-    result = Radiometry("relative radiance", tags.black_level or 0.0, 1.0, 1.0, centre, k)
+    result = Radiometry("relative radiance", tags.black_level or 0.0, 1.0, 1.0, centre, k, divides)
     return plausible(result, size_px)[0]
 
 

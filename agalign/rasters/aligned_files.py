@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.fill import fillnodata
 
+from agalign.cameras.dji import Dji
+from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import SAME_ROWS, GridRows, GridVignetting, vignetting_of, vignetting_on_grid
 from agalign.cameras.tag_transfer import TransferredTags, band_tags, capture_tags
@@ -164,7 +166,8 @@ def _correction(band: Band) -> Radiometry | None:
     if known is not None and any(known.vignetting) and known.vignetting_divides:
         return replace(known, quantity="relative radiance", full_scale=1.0, gain=1.0, row_gradient=0.0)
     with suppress(UnreadableFileError):
-        return vignetting_of(read_tags(band.path, band.page), band.size_px)
+        tags = read_tags(band.path, band.page)
+        return vignetting_of(tags, band.size_px, divides=not isinstance(camera_of(tags), Dji))
     return None
 
 

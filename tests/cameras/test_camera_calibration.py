@@ -18,7 +18,8 @@ from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.sun import sun_position
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Entry, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import camera_overviews, flights_of
-from agalign.pixels.radiometry import with_radiometry
+from agalign.pixels.radiometry import calibrated, with_radiometry
+from agalign.rasters.aligned_files import _correction
 from agalign.values.capture import Band, Capture, CaptureTime
 
 from ..conftest import write_band
@@ -285,6 +286,18 @@ def test_a_factor_that_dji_writes_differently_twice_is_not_used(tmp_path: Path) 
     band = only(discover(tmp_path)).bands[0]
     assert band.radiometry is None
     assert "other tags contradict SensorGainAdjustment" in band.missing_calibration
+
+
+@pytest.mark.parametrize("gain", ["1", ""])
+def test_corners_of_raw_numbers_of_dji_become_brighter(tmp_path: Path, gain: str) -> None:
+    """DJI multiplies by the polynomial, also in a file that lacks tags for radiance."""
+    k = "1e-5, 0, 0, 0, 0, 0"
+    phantom(tmp_path, 1, {"SensorGain": gain}, more={"VignettingCenter": "800, 650", "VignettingPolynomial": k})
+    band = only(discover(tmp_path)).bands[0]
+    assert (band.radiometry is None) == (not gain)
+    correction = _correction(band)
+    raw = np.full((1, 1), correction.black_level + 1000)
+    assert calibrated(raw, correction, 0, 650)[0, 0] == pytest.approx(1000 * (1 + 1e-5 * 800), rel=1e-6)
 
 
 def test_a_missing_gain_adjustment_is_named_with_its_size(tmp_path: Path) -> None:
