@@ -46,8 +46,9 @@ _GEOMETRY = (
 """Values of lens and rig, which are replaced by those of the reference."""
 _SENSOR_ONLY = _of_pix4d("InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName") + _of_dji("VignettingData")
 """Values that refer to the sensor's own pixels and are removed."""
-_VIGNETTING = _of_pix4d("VignettingCenter VignettingPolynomial")
-_RADIOMETRY = _VIGNETTING + _of_pix4d("BlackCurrent") + _of_dji("BlackLevel")
+_VIGNETTING = _of_pix4d("VignettingCenter VignettingPolynomial") + _of_dji("VignettingFlag")
+_RADIOMETRY = _VIGNETTING + _of_pix4d("BlackCurrent RadiometricCalibration BandSensitivity IsNormalized")
+_RADIOMETRY += _of_dji("BlackLevel SensorGainAdjustment")
 _RADIOMETRY += names_in(micasense.NAMESPACE, "RadiometricCalibration DarkRowValue")
 """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
 TransferredTags = tuple[Directory, Directory, Directory]

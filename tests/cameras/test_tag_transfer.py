@@ -120,6 +120,22 @@ def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
         assert (result.black_level is None) == radiometry
 
 
+APPLIED = [(NAMESPACE, name) for name in ("RadiometricCalibration", "IsNormalized", "BandSensitivity")]
+APPLIED += [(DJI, name) for name in ("SensorGainAdjustment", "VignettingFlag")]
+
+
+def test_tags_of_factors_in_the_pixels_are_removed(tmp_path: Path) -> None:
+    """DJI writes its gain adjustment under two names, and that the pixels are not calibrated."""
+    write_capture(tmp_path, VENDORS["Phantom 4"])
+    source, reference = tmp_path / "DJI_0015.TIF", tmp_path / "DJI_0012.TIF"
+    values = dict.fromkeys(APPLIED, ("0",)) | {(DJI, "SensorGain"): ("2",)}
+    add_directories(source, {XMP: byte_string(packet(values, "attributes"))}, {}, {})
+    for radiometry in (False, True):
+        result = read_tags(transferred(source, reference, UNCHANGED, radiometry=radiometry))
+        assert [name for name in APPLIED if name in result.xmp] == ([] if radiometry else APPLIED)
+        assert result.number(DJI, "SensorGain") == 2
+
+
 def test_the_row_gradient_is_that_of_the_new_rows(tmp_path: Path) -> None:
     """Row 10 of a file with twice as many rows, cropped, is row 45 of the band's own file."""
     write_capture(tmp_path, VENDORS["RedEdge"])
