@@ -2,6 +2,8 @@
 input file, with the lens and rig of the reference instead of the band's own.
 """
 
+import math
+import struct
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
@@ -62,7 +64,7 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
     source = _directories(reference)
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
     exif = _some(source[EXIF], _TIMES | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
-    return first, _on_grid(_without_unset_clock(exif), source[EXIF], grid), source[GPS]
+    return first, _on_grid(_without_unset_clock(exif), source[EXIF], reference, grid), source[GPS]
 
 
 def band_tags(
@@ -91,7 +93,7 @@ def band_tags(
     _put_radiometry(packet, tags_of(own), vignetting, rows, radiometry=radiometry)
     if serialised := packet.serialised():
         first[XMP] = tiff_directory.byte_string(serialised)
-    exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], grid)
+    exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], reference, grid)
     return _without_unset_clock(first), exif, own[GPS]
 
 
@@ -194,9 +196,13 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
     return {tag: directory[tag] for tag in tags if tag in directory}
 
 
-def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directory:
+def _on_grid(exif: Directory, of_reference: Directory, reference: Band, grid: OutputGrid) -> Directory:
     """The Exif directory with the focal length and pixel density of the reference, and the size of the output."""
-    result = exif | _some(reference, _GEOMETRIC_EXIF)
+    result = exif | _some(of_reference, _GEOMETRIC_EXIF)
+    if (of_film := Base.FocalLengthIn35mmFilm) in result:  # relative to the diagonal of the image
+        share = math.hypot(grid.width / grid.scale.x, grid.height / grid.scale.y) / math.hypot(*reference.size_px)
+        with suppress(TypeError, ValueError, struct.error):  # a damaged tag
+            result[of_film] = tiff_directory.short(round(tiff_directory.values(result[of_film]) / share))
     densities: set[int] = {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution}
     for tag in densities & result.keys() if grid.scale.mean != 1 else ():
         density = finite(tiff_directory.values(result[tag]))

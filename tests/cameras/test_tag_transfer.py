@@ -120,6 +120,24 @@ def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
         assert (result.black_level is None) == radiometry
 
 
+@pytest.mark.parametrize(
+    ("grid", "expected"),
+    [
+        (UNCHANGED, 40),
+        (OutputGrid(10, 10, 128, 96), 50),
+        (OutputGrid(20, 20, 256, 192, scale=PixelScale(2.0, 2.0)), 50),
+        (OutputGrid(0, 0, 320, 240, scale=PixelScale(2.0, 2.0)), 40),
+    ],
+)
+def test_the_focal_length_in_35_mm_film_is_that_of_the_cropped_image(
+    tmp_path: Path, grid: OutputGrid, expected: int
+) -> None:
+    """A smaller part of the sensor is as if taken with a longer focal length."""
+    source = write_file(tmp_path / "a.tif")
+    add_directories(source, {}, {Base.FocalLengthIn35mmFilm: short(40)}, {})
+    assert read_tags(transferred(source, source, grid)).exif["FocalLengthIn35mmFilm"] == expected
+
+
 APPLIED = [(NAMESPACE, name) for name in ("RadiometricCalibration", "IsNormalized", "BandSensitivity")]
 APPLIED += [(DJI, name) for name in ("SensorGainAdjustment", "VignettingFlag")]
 
