@@ -39,6 +39,8 @@ class Irradiance(NamedTuple):
     value: float = 0.0
     """W / m^2 / nm; 0 without a usable reading."""
     errors: Errors = ()
+    unit: float = 1.0
+    """W / m^2 / nm per unit of the tags of the file."""
     problem: str = ""
     """Why no reading is used although the tags have one; empty if one is, or they have none."""
 
@@ -99,7 +101,8 @@ def _horizontal(tags: Tags, elevation: float | None) -> Irradiance | None:
             return Irradiance(problem=f"{names} and the components ({calculated:.4g}) contradict each other")
         value = near[0]
         errors.append(contradiction("components of the irradiance", tag, calculated))
-    return Irradiance(value * _scale_of_dls_2(tags), tuple(errors))
+    unit = _scale_of_dls_2(tags)
+    return Irradiance(value * unit, tuple(errors), unit)
 
 
 def _scale_of_dls_2(tags: Tags) -> float:
@@ -117,14 +120,14 @@ def _in_plane_of_sensor(tags: Tags, sun: tuple[float, float] | None) -> Irradian
     if not is_agreed:
         return Irradiance(problem="SpectralIrradiance and Irradiance contradict each other")
     max_si = 3.0  # W / m^2 / nm, twice that of a clear noon: larger numbers have the unit of the DLS 2
-    scale = _positive(tags, "IrradianceScaleToSIUnits") or (1.0 if value <= max_si else _SCALE_OF_DLS_2)
+    unit = _positive(tags, "IrradianceScaleToSIUnits") or (1.0 if value <= max_si else _SCALE_OF_DLS_2)
     attitude_deg = _sensor_attitude_deg(tags)
     if sun is None or attitude_deg is None:
-        return Irradiance(value * scale, (LIGHT_SENSOR[1], REPEATABILITY, NO_TILT))
+        return Irradiance(value * unit, (LIGHT_SENSOR[1], REPEATABILITY, NO_TILT), unit)
     horizontal = horizontal_irradiance(value, attitude_deg, sun)
     if math.isnan(horizontal):
         return Irradiance(problem="the light sensor points too far from the sun, or the sun is below the horizon")
-    return Irradiance(horizontal * scale, (LIGHT_SENSOR[1], REPEATABILITY, tilt_error(horizontal / value)))
+    return Irradiance(horizontal * unit, (LIGHT_SENSOR[1], REPEATABILITY, tilt_error(horizontal / value)), unit)
 
 
 def _spectral(tags: Tags) -> tuple[float | None, bool]:

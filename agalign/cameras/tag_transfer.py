@@ -162,7 +162,8 @@ def _put_radiometry(
     """Replace the vignetting and the row gradient; `tags` are the band's own. A vignetting of None is removed, and with
     `radiometry` also the other values that have been applied to the pixels.
 
-    The horizontal irradiance is added under the names that OpenDroneMap reads, with its unit.
+    The horizontal irradiance is added under the names that OpenDroneMap reads, with its unit, which is also that of the
+    other irradiances.
     """
     if radiometry:
         packet.remove(_RADIOMETRY)
@@ -174,9 +175,12 @@ def _put_radiometry(
         packet.put((pix4d.NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
     if (coefficients := micasense.calibration_on_rows(tags, rows)) is not None:
         packet.put(micasense.CALIBRATION, _texts(coefficients))
-    irradiance = dls.irradiance(tags).value if isinstance(camera_of(tags), micasense.MicaSense) else 0.0
-    if irradiance > 0:
-        for name, value in (("HorizontalIrradiance", irradiance), ("IrradianceScaleToSIUnits", 1.0)):
+    light = dls.irradiance(tags) if isinstance(camera_of(tags), micasense.MicaSense) else dls.Irradiance()
+    if light.value > 0:
+        for name, value in (
+            ("HorizontalIrradiance", light.value / light.unit),
+            ("IrradianceScaleToSIUnits", light.unit),
+        ):
             packet.add((pix4d.NAMESPACE, name), _texts([value])[0])
 
 

@@ -35,7 +35,7 @@ from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
-from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture, write_file
+from .test_vendors import DJI, DLS, MICASENSE, SIZE, VENDORS, packet, write_capture, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -136,6 +136,19 @@ def test_the_focal_length_in_35_mm_film_is_that_of_the_cropped_image(
     source = write_file(tmp_path / "a.tif")
     add_directories(source, {}, {Base.FocalLengthIn35mmFilm: short(40)}, {})
     assert read_tags(transferred(source, source, grid)).exif["FocalLengthIn35mmFilm"] == expected
+
+
+def test_one_unit_is_that_of_all_irradiances(tmp_path: Path) -> None:
+    """A DLS 2 counts in 0.01 W / m^2 / nm, also in the tag of the camera that it copies."""
+    write_capture(tmp_path, VENDORS["RedEdge"])
+    source = tmp_path / "IMG_0007_4.tif"
+    written = {(NAMESPACE, "BandName"): ("NIR",), (NAMESPACE, "Irradiance"): ("62.5",)}
+    written |= {(DLS, "SpectralIrradiance"): ("62.5",), (DLS, "HorizontalIrradiance"): ("67.3",)}
+    add_directories(source, {271: text("MicaSense"), XMP: byte_string(packet(written, "elements"))}, {}, {})
+    result = read_tags(transferred(source, tmp_path / "IMG_0007_2.tif", UNCHANGED))
+    unit = result.number(NAMESPACE, "IrradianceScaleToSIUnits")
+    assert result.number(NAMESPACE, "HorizontalIrradiance") * unit == pytest.approx(0.673)
+    assert result.number(NAMESPACE, "Irradiance") * unit == pytest.approx(0.625)
 
 
 APPLIED = [(NAMESPACE, name) for name in ("RadiometricCalibration", "IsNormalized", "BandSensitivity")]

@@ -15,6 +15,7 @@ from PIL import Image
 from agalign.cameras.consistency import pixel_scale
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
+from agalign.cameras.dls import NAMESPACE as DLS
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import NAMESPACE
@@ -30,10 +31,11 @@ DJI, MICASENSE, SENTERA = "dji.com/drone-dji", "micasense.com/MicaSense", "sente
 URIS = {
     "Camera": "http://pix4d.com/camera/1.0/",
     "MicaSense": "http://micasense.com/MicaSense/1.0/",
+    "DLS": "http://micasense.com/DLS/1.0/",
     "drone-dji": "http://www.dji.com/drone-dji/1.0/",
     "Sentera": "https://www.sentera.com/schemas/",
 }
-PREFIXES = {NAMESPACE: "Camera", MICASENSE: "MicaSense", DJI: "drone-dji", SENTERA: "Sentera"}
+PREFIXES = {NAMESPACE: "Camera", MICASENSE: "MicaSense", DLS: "DLS", DJI: "drone-dji", SENTERA: "Sentera"}
 SIZE = 160, 120
 
 Values = Mapping[tuple[str, str], Sequence[str]]
