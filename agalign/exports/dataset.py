@@ -19,6 +19,7 @@ from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import read_sidecar
 from agalign.values.arguments import checked
 from agalign.values.capture import CaptureTime
+from agalign.values.radiometry import are_raw_numbers
 
 if TYPE_CHECKING:
     import xarray
@@ -39,12 +40,12 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     Returns
     -------
     xarray.Dataset
-        A variable (y, x) for each band with pixels, with the attributes `wavelength_nm`, `units` and `status`. The
-        coordinates are pixel centres: map coordinates if the capture is georeferenced (`.rio.crs`), else px of the
-        output, with (0, 0) the centre of the top-left pixel. On a rotated grid, as `--georeference` writes it, the map
-        coordinates of every pixel are `xc` and `yc`. A capture with a parallax map has the variable `parallax` (px
-        along a baseline of length 1, larger for nearer objects) and, if the run wrote them, `confidence` and `range`
-        (m).
+        A variable (y, x) for each band with pixels, with the attributes `wavelength_nm`, `status` and, if it is known,
+        `units` (`count`: raw numbers). The coordinates are pixel centres: map coordinates if the capture is
+        georeferenced (`.rio.crs`), else px of the output, with (0, 0) the centre of the top-left pixel. On a rotated
+        grid, as `--georeference` writes it, the map coordinates of every pixel are `xc` and `yc`. A capture with a
+        parallax map has the variable `parallax` (px along a baseline of length 1, larger for nearer objects) and, if
+        the run wrote them, `confidence` and `range` (m).
 
     Raises
     ------
@@ -216,7 +217,12 @@ def _variable(file: "xarray.DataArray", band: BandResult, index: int, name: str,
     attrs = {k: v[index - 1] if isinstance(v, tuple) else v for k, v in file.attrs.items()}
     names = {"_FillValue": "_FillValue", "scales": "scale_factor", "offsets": "add_offset"}
     encoding = {new: attrs[k] for old, new in names.items() for k in (old, new) if k in attrs}
-    one.attrs = encoding | {"long_name": band.band, "units": attrs.get("units") or "count", "status": band.status}
+    one.attrs = encoding | {"long_name": band.band, "status": band.status}
+    scales = file.encoding | file.attrs  # in either
+    scale = np.atleast_1d(scales.get("scales", scales.get("scale_factor", 1.0)))
+    is_count = are_raw_numbers(file.encoding["rasterio_dtype"], float(scale[min(index, len(scale)) - 1]))
+    if unit := attrs.get("units") or ("count" if is_count else ""):
+        one.attrs["units"] = unit
     if band.wavelength_nm is not None:
         one.attrs["wavelength_nm"] = band.wavelength_nm
     return one

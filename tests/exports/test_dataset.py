@@ -108,6 +108,19 @@ def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
     assert np.isnan(masked.red.values[:40, :40]).all()
 
 
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("scale", [(1e-4, 1e-4), (1e-4, 2e-4)])
+def test_scaled_numbers_are_not_counts(scale: tuple[float, float], masked: bool, tmp_path: Path) -> None:
+    """No tag states their unit. CF: `units` is that of the values after scale and offset."""
+    write_capture(tmp_path / "in", "green", "red")
+    for path, own in zip(sorted((tmp_path / "in").iterdir()), scale, strict=True):
+        with rasterio.open(path, "r+") as dataset:
+            dataset.scales = (own,)
+    agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded())
+    capture = agalign.open_capture(tmp_path / "out" / "f.json", masked=masked)
+    assert [band.attrs.get("units") for band in capture.values()] == [None, None]
+
+
 def test_captures_on_rotated_grids_are_stacked(flight: Path, tmp_path: Path) -> None:
     agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True, ground_elevation_m=0.0))
     one = agalign.open_capture(tmp_path / "0000SET" / "000" / "IMG_0001.json")
