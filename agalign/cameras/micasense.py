@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.consistency import full_scale, raw_step_of
@@ -101,9 +103,12 @@ class MicaSense(Camera):
         return sun_by_sensor(tags)
 
 
-def calibration_on_rows(tags: Tags, rows: pix4d.GridRows) -> tuple[float, float, float] | None:
-    """Return RadiometricCalibration for pixels on other rows, where 1 + a2 y / t - a3 y is that of the band's own row
-    up to a factor, which a1 contains; None if a tag is missing.
+def calibration_of_output(tags: Tags, band: Band, rows: pix4d.GridRows) -> tuple[float, float, float] | None:
+    """Return RadiometricCalibration for raw numbers of a band that are written on other rows, and in all bits of their
+    type; None if a tag is missing.
+
+    1 + a2 y / t - a3 y is that of the band's own row up to a factor, which a1 contains. Programs divide by
+    2^BitsPerSample, which is 12 in some files of the camera and 16 in the output.
     """
     a, exposure_s = tags.numbers(*CALIBRATION, 3), finite(tags.exif.get("ExposureTime"))
     if len(a) != 3 or not exposure_s:
@@ -111,7 +116,11 @@ def calibration_on_rows(tags: Tags, rows: pix4d.GridRows) -> tuple[float, float,
     at_first_row = 1 + (a[1] / exposure_s - a[2]) * rows.first
     if not at_first_row > 0:
         return None
-    return a[0] / at_first_row, a[1] * rows.step / at_first_row, a[2] * rows.step / at_first_row
+    of_type = 2.0 ** (8 * np.dtype(band.dtype).itemsize)
+    known = band.radiometry
+    full_scale = known.full_scale if known is not None and known.is_of_light else of_type
+    a1, a2, a3 = (k / at_first_row for k in a)
+    return a1 * of_type / full_scale, a2 * rows.step, a3 * rows.step
 
 
 def _iso(tags: Tags) -> float | None:

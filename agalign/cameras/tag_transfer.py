@@ -90,7 +90,7 @@ def band_tags(
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     packet.take(reference_packet, _GEOMETRY)
     _put_geometry(packet, reference, tags_of(of_reference), grid)
-    _put_radiometry(packet, tags_of(own), vignetting, rows, radiometry=radiometry)
+    _put_radiometry(packet, source, tags_of(own), vignetting, rows, radiometry=radiometry)
     if serialised := packet.serialised():
         first[XMP] = tiff_directory.byte_string(serialised)
     exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], reference, grid)
@@ -157,9 +157,9 @@ def _put_principal_point(packet: Packet, reference: Band, tags: Tags, grid: Outp
 
 
 def _put_radiometry(
-    packet: Packet, tags: Tags, vignetting: GridVignetting | None, rows: GridRows, *, radiometry: bool
+    packet: Packet, band: Band, tags: Tags, vignetting: GridVignetting | None, rows: GridRows, *, radiometry: bool
 ) -> None:
-    """Replace the vignetting and the row gradient; `tags` are the band's own. A vignetting of None is removed, and with
+    """Replace the vignetting and the calibration; `tags` are the band's own. A vignetting of None is removed, and with
     `radiometry` also the other values that have been applied to the pixels.
 
     The horizontal irradiance is added under the names that OpenDroneMap reads, with its unit, which is also that of the
@@ -173,7 +173,7 @@ def _put_radiometry(
     else:
         packet.put((pix4d.NAMESPACE, "VignettingCenter"), _texts(vignetting.centre_px))
         packet.put((pix4d.NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
-    if (coefficients := micasense.calibration_on_rows(tags, rows)) is not None:
+    if (coefficients := micasense.calibration_of_output(tags, band, rows)) is not None:
         packet.put(micasense.CALIBRATION, _texts(coefficients))
     light = dls.irradiance(tags) if isinstance(camera_of(tags), micasense.MicaSense) else dls.Irradiance()
     if light.value > 0:

@@ -184,6 +184,21 @@ def test_the_row_gradient_is_that_of_the_new_rows(tmp_path: Path) -> None:
         assert gain(*coefficients, row) == pytest.approx(gain(2e-4, 1e-7, -5e-5, 40 + row / 2), rel=1e-6)
 
 
+@pytest.mark.parametrize(("bits", "factor"), [(12, 16), (16, 1)])
+def test_numbers_of_12_bits_in_a_file_of_16_bits_have_their_radiance(tmp_path: Path, bits: int, factor: int) -> None:
+    """Programs divide by 2 ** BitsPerSample."""
+    source = tmp_path / "IMG_0007_2.tif"
+    with rasterio.open(source, "w", width=SIZE[0], height=SIZE[1], count=1, dtype="uint16", nbits=bits) as dataset:
+        dataset.write(np.full((1, *SIZE[::-1]), 1000, np.uint16))
+    values = {(NAMESPACE, "BandName"): ("Green",), (MICASENSE, "RadiometricCalibration"): ("2e-4", "1e-7", "-5e-5")}
+    first = {271: text("MicaSense"), XMP: byte_string(packet(values, "sequences")), 50714: short(300)}
+    add_directories(source, first, {Base.ExposureTime: rational(1e-3), 34855: short(100)}, {})
+    result = read_tags(transferred(source, band_of(source), UNCHANGED))
+    expected = 2e-4 * factor, 1e-7, -5e-5
+    assert result.numbers(MICASENSE, "RadiometricCalibration", 3) == pytest.approx(expected)
+    assert result.black_level == 300
+
+
 def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Sequoia"])
     path = tmp_path / "IMG_180413_080658_0000_GRE.TIF"
