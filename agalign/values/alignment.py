@@ -389,12 +389,12 @@ class Alignment:
         if self.moving_size_px not in (None, planes.shape[:0:-1]):
             given, aligned = (f"{width} x {height} px" for width, height in (planes.shape[:0:-1], self.moving_size_px))
             raise InputError(f"moving has {given}, the aligned image {aligned}; give an image of that size")
-        mask = valid_of(moving, valid, (planes.shape[1], planes.shape[2]))
-        for plane in planes:
-            mask = mask & (np.isfinite(plane) if plane.dtype.kind == "f" else True) & (plane != nodata)
         fill = nodata if nodata is not None else math.nan if planes.dtype.kind == "f" else 0
         if not can_hold(planes.dtype, fill):
             raise InputError(f"nodata is {nodata:g}, which {planes.dtype} cannot hold")
+        mask = valid_of(moving, valid, (planes.shape[1], planes.shape[2]))
+        for plane in planes:
+            mask = mask & (np.isfinite(plane) if plane.dtype.kind == "f" else True) & (plane != nodata)
         pixels, known = resample_planes(planes, mask, self.mapping, self.size_px, interpolation, fill)
         if np.ndim(moving) == 2:
             return pixels[0], known

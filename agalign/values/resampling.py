@@ -280,9 +280,10 @@ def _filled(pixels: NDArray[np.generic], valid: Mask) -> NDArray[np.generic]:
 
 
 def can_hold(dtype: np.dtype[np.generic], value: float) -> bool:
-    """Return True for any value, unless the type is one of integers: then for those within its limits."""
+    """Return True for a value within the limits of a type, and for NaN and infinity if it is a floating-point type."""
     if dtype.kind not in "ui":
-        return True
+        with np.errstate(over="ignore"):
+            return not np.isfinite(value) or bool(np.isfinite(np.float64(value).astype(dtype)))
     limits = np.iinfo(str(dtype))
     return float(value).is_integer() and limits.min <= value <= limits.max
 

@@ -289,6 +289,9 @@ def test_what_cannot_be_resampled() -> None:
     for nodata in (-9999, 0.5, np.nan):
         with pytest.raises(InputError, match=f"nodata is {nodata:g}, which uint8 cannot hold"):
             result.warp(np.zeros(SIZE[::-1], np.uint8), nodata=nodata)
+    with pytest.raises(InputError, match=r"nodata is 1e\+300, which float32 cannot hold"):
+        result.warp(np.zeros(SIZE[::-1], np.float32), nodata=1e300)
+    assert result.warp(np.zeros(SIZE[::-1], np.float32), nodata=-3.40282346638529e38)[1].any()  # as GDAL rounds it
 
 
 @pytest.mark.parametrize("change", [np.s_[::2, ::2], np.s_[:-1], np.s_[:, 8:]], ids=["half", "height", "width"])
