@@ -20,13 +20,13 @@ from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
 from agalign.flight.fingerprint import input_samples
-from agalign.host.files import check_inside, max_name_bytes, remove_companions
+from agalign.host.files import RUN_FILE, check_inside, max_name_bytes, remove_companions
 from agalign.host.own_files import foreign, is_own_file, refuse_foreign, refuse_foreign_pages
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
 from agalign.records.panels_and_sky import PANEL_AND_SKY_FILES
-from agalign.records.run_record import file_states
+from agalign.records.run_record import RUN_START, file_states
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import OtherSchemaError, is_sidecar, read_with_change
 from agalign.spectral_indices.rasters import IndexRasters, index_rasters
@@ -206,8 +206,10 @@ def refuse_results_elsewhere(captures: Sequence[Capture], out: Path, read: ReadS
 
 
 def refuse_foreign_run_files(out: Path) -> None:
-    """Raise ConfigurationError for a file with the name of a page, or of that of panels or sky, that no run wrote."""
-    for name, start in PANEL_AND_SKY_FILES.items():
+    """Raise ConfigurationError for a file that no run wrote with the name of a page, of the run record, or of the file
+    of panels or sky.
+    """
+    for name, start in {RUN_FILE: RUN_START, **PANEL_AND_SKY_FILES}.items():
         refuse_foreign(out / name, (start,))
     refuse_foreign_pages(out)
 

@@ -25,6 +25,8 @@ from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import label_of
 from agalign.values.capture import Capture
 
+RUN_START = b'{\n "schema": "agalign-run/'
+"""How a run record of any version starts."""
 _SCHEMA = "agalign-run/2"
 _MAX_NAMED = 10
 """Captures that a sentence names."""

@@ -26,6 +26,13 @@ def page(out: Path, _: Path) -> Path:
     return out / "index.html"
 
 
+def record(out: Path, _: Path) -> Path:
+    """A file of another program with the name of the run record."""
+    out.mkdir()
+    (out / "agalign-run.json").write_text("{}")
+    return out / "agalign-run.json"
+
+
 def settings(out: Path, _: Path) -> Path:
     """JSON of another program at the place of a sidecar."""
     place = out / "0000SET" / "000" / "IMG_0001.json"
@@ -34,7 +41,7 @@ def settings(out: Path, _: Path) -> Path:
     return place
 
 
-@pytest.mark.parametrize("make", [raw, page, settings])
+@pytest.mark.parametrize("make", [raw, page, record, settings])
 def test_a_run_refuses_a_folder_with_files_of_its_names(
     flight: Path, tmp_path: Path, make: Callable[[Path, Path], Path]
 ) -> None:
