@@ -21,7 +21,7 @@ from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
 from agalign.flight.fingerprint import input_samples
 from agalign.host.files import RUN_FILE, check_inside, max_name_bytes, remove_companions
-from agalign.host.own_files import foreign, is_own_file, refuse_foreign, refuse_foreign_pages
+from agalign.host.own_files import foreign, is_own_file, is_taken, refuse_foreign, refuse_foreign_pages
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
@@ -45,7 +45,7 @@ class State(Enum):
     AS_LISTED = "in a sidecar that was not edited, with this size", "write", "remove"
     WITH_MARK = "file with the mark of the program, or empty", "write", "remove"
     CHANGED = "listed with another size, without mark; other JSON where a sidecar was", "write", "keep"
-    OF_USER = "any other file", "refuse", "keep"
+    OF_USER = "any other file, pipe or device, and a link to a folder", "refuse", "keep"
     INDEX = "index in the sidecar, where another output would be", "refuse", "remove"
     OTHER_RESULT = "sidecar of another capture, or of a version with another schema", "refuse", "refuse"
     IMAGE = "image of the input", "refuse", "refuse"
@@ -133,9 +133,9 @@ class _Names:
 
 def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
     """Return the state of the file of a product, given the sizes of the listed files."""
-    if not path.is_file():
+    if not is_taken(path):
         return State.NO_FILE, ""
-    if path.stat().st_size == listed.get(path):
+    if path.is_file() and path.stat().st_size == listed.get(path):
         return State.AS_LISTED, ""
     if is_own(path):
         return State.WITH_MARK, ""
@@ -144,8 +144,10 @@ def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
 
 def _sidecar(path: Path, capture: Capture, out: Path, read: ReadSidecar) -> _Found:
     """Return the state of the path of the sidecar of a capture."""
-    if not path.is_file():
+    if not is_taken(path):
         return State.NO_FILE, ""
+    if not path.is_file():
+        return State.OF_USER, foreign(path)
     try:
         earlier, _ = read(path)
     except OtherSchemaError as error:

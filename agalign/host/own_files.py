@@ -27,6 +27,13 @@ _SEARCHED_BYTES = 1 << 16
 """The mark is near the start of a file, or near its end in a TIFF to which tags were added."""
 
 
+def is_taken(path: Path) -> bool:
+    """Return True for a file, pipe or device, or a link to a folder, which a new file would replace; False for a
+    folder, where no file can be written, and for a link to nothing.
+    """
+    return path.exists() and (path.is_symlink() or not path.is_dir())
+
+
 def is_own_file(path: Path, text_starts: tuple[bytes, ...] = ()) -> bool:
     """Return True for an image or a model with the mark, a text with one of these starts, and an empty file, which has
     no contents.
@@ -34,7 +41,7 @@ def is_own_file(path: Path, text_starts: tuple[bytes, ...] = ()) -> bool:
     Texts have no place for a mark; their writers know how they start (`Product.text_starts`).
     """
     with suppress(OSError):
-        return not path.stat().st_size or has_mark(path, text_starts)
+        return (path.is_file() and not path.stat().st_size) or has_mark(path, text_starts)
     return False
 
 
@@ -60,7 +67,7 @@ def foreign(path: Path, remedy: str = _OTHER_FOLDER) -> str:
 
 def refuse_foreign(path: Path, text_starts: tuple[bytes, ...] = (), remedy: str = _OTHER_FOLDER) -> None:
     """Raise ConfigurationError for a file that is not one as `is_own_file`."""
-    if path.is_file() and not is_own_file(path, text_starts):
+    if is_taken(path) and not is_own_file(path, text_starts):
         raise ConfigurationError(foreign(path, remedy))
 
 

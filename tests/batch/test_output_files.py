@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.batch.output_files import State, refuse_to_overwrite, remove_outputs
+from agalign.batch.output_files import State, refuse_foreign_run_files, refuse_to_overwrite, remove_outputs
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.values.capture import Capture
 
@@ -70,6 +70,16 @@ def of_user(case: Case) -> Case:
     return Path(shutil.copy(case[1][0].reference.path, case[0])), case[1]
 
 
+def pipe(case: Case) -> Case:
+    os.mkfifo(case[0])
+    return case
+
+
+def link_to_a_folder(case: Case) -> Case:
+    case[0].symlink_to(".")
+    return case
+
+
 def of_user_in_an_edited_sidecar(case: Case) -> Case:
     path, captures = of_user(case)
     sidecar = read_sidecar(path.with_name("f.json"))
@@ -123,6 +133,8 @@ def too_long(case: Case) -> Case:
         (changed, State.CHANGED, "write", "keep"),
         (of_user, State.OF_USER, "was not written by agalign", "keep"),
         (of_user_in_an_edited_sidecar, State.OF_USER, "was not written by agalign", "keep"),
+        (pipe, State.OF_USER, "was not written by agalign", "keep"),
+        (link_to_a_folder, State.OF_USER, "was not written by agalign", "keep"),
         (index, State.INDEX, "is an index, which another output of this name", "remove"),
         (other_result, State.OTHER_RESULT, "belongs to a different capture", "belongs to a different capture"),
         (image, State.IMAGE, "is an image to be aligned", "is an image to be aligned"),
@@ -150,10 +162,28 @@ def test_what_is_there_decides(
 
 
 @pytest.mark.slow
+def test_a_pipe_is_no_damaged_sidecar(case: Case) -> None:
+    path, captures = sidecar(case)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(agalign.ConfigurationError, match="was not written by agalign"):
+        refuse_to_overwrite(captures, path.parent, WRITING)
+    remove_outputs(captures[0], path.parent, WRITING)
+    assert path.is_fifo()
+
+
+@pytest.mark.slow
 def test_an_index_that_is_deleted_as_advised_is_no_obstacle(case: Case) -> None:
     path, captures = index(case)
     path.unlink()
     refuse_to_overwrite(captures, path.parent, WRITING)
+
+
+@pytest.mark.parametrize("name", ["agalign-run.json", "index.html", "panels.json"])
+def test_a_pipe_is_no_page_of_an_earlier_run(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(agalign.ConfigurationError, match=f"{name}: was not written by agalign"):
+        refuse_foreign_run_files(tmp_path)
 
 
 def test_the_cases_cover_every_state() -> None:
