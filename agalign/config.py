@@ -91,10 +91,11 @@ def _yes_or_no(yes: str, no: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
 
 
+_OPTIONS = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True)
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()))
 
 
-@validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True))
+@validated.dataclass(frozen=True, config=_OPTIONS)
 class DiscoverOptions:
     """Options of `discover` and `align_folder`: which files and bands are used.
 
@@ -133,7 +134,7 @@ class DiscoverOptions:
     """Ignore files that match this glob; repeatable."""
 
 
-@validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
+@validated.dataclass(frozen=True, config=_OPTIONS)
 class RunOptions:
     """How to run. Two fields change results: with `align_panels`, calibration panels give no reflectance, and captures
     that take longer than `timeout_s` teach nothing and have none.

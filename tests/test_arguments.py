@@ -119,6 +119,14 @@ def test_a_wrong_number_of_workers_is_refused() -> None:
         pass
 
 
+@pytest.mark.parametrize(
+    ("options", "wrong"), [(agalign.RunOptions, {"overwite": True}), (agalign.DiscoverOptions, {"band": ("NIR",)})]
+)
+def test_an_option_that_does_not_exist_is_refused(options: Callable[..., object], wrong: dict[str, object]) -> None:
+    with pytest.raises((TypeError, ValueError), match=next(iter(wrong))):
+        options(**wrong)
+
+
 def test_arguments_that_do_not_exist_are_those_of_python() -> None:
     @checked
     def function(number: int) -> int:
