@@ -155,6 +155,8 @@ RAGGED = [[1, 2], [3]]
         ({"fixed": RAGGED}, "fixed is not an array: its rows have different lengths"),
         ({"fixed_valid": RAGGED}, "fixed_valid is not an array"),
         ({"fixed": IMAGE.astype(np.float64) * 1e300}, "fixed has only values beyond 1e"),
+        ({"fixed": IMAGE[..., None][..., :0]}, "fixed is (64, 64, 0): images have 1 to 16 channels"),
+        ({"moving": IMAGE[None][:0]}, "moving is (0, 64, 64): images have 1 to 16 channels"),
     ],
 )
 def test_arguments_that_cannot_be_aligned_are_named(arguments: dict[str, Any], said: str) -> None:

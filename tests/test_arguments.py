@@ -100,6 +100,7 @@ def test_every_public_function_is_tried() -> None:
         (lambda: agalign.align_folder("a", "out", progress=3), "progress is 3, not a function"),
         (lambda: agalign.export("out", "new", "x"), "program is 'x'; choose from odm, metashape, pix4d"),
         (lambda: agalign.open_flight("out", masked="no"), "masked is 'no', not True or False"),
+        (lambda: alignment().is_usable("1"), "accept_predicted_px is '1', not a number"),
         (lambda: alignment().warp(CONSTANT, nodata="x"), "nodata is 'x', not a number"),
         (lambda: agalign.read_alignment("a.json", 3), "band is 3, not a text"),
         (lambda: agalign.dask_executor("local", jobs="2"), "jobs is '2', not an integer"),

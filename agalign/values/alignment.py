@@ -475,6 +475,7 @@ class Alignment:
             return np.full(self.size_px[::-1], np.inf, np.float32)
         return ErrorOnGrid.of(self.error, self.size_px).on_tile(Tile(0, 0, *self.size_px))
 
+    @checked
     def is_usable(self, accept_predicted_px: float) -> bool:
         """Return True if the band is aligned, or predicted with a small expected error.
 

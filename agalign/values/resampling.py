@@ -66,8 +66,8 @@ def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
         )
     channels_last = array.ndim == 3 and array.shape[-1] <= _MAX_CHANNELS < array.shape[0]
     planes = np.moveaxis(array, -1, 0) if channels_last else array if array.ndim == 3 else array[None]
-    if len(planes) > _MAX_CHANNELS:
-        raise InputError(f"{name} is {array.shape}: images have at most {_MAX_CHANNELS} channels")
+    if not 1 <= len(planes) <= _MAX_CHANNELS:
+        raise InputError(f"{name} is {array.shape}: images have 1 to {_MAX_CHANNELS} channels")
     return planes, channels_last
 
 
