@@ -156,6 +156,7 @@ RAGGED = [[1, 2], [3]]
         ({"fixed_valid": RAGGED}, "fixed_valid is not an array"),
         ({"fixed": IMAGE.astype(np.float64) * 1e300}, "fixed has only values beyond 1e"),
         ({"fixed": IMAGE[..., None][..., :0]}, "fixed is (64, 64, 0): images have 1 to 16 channels"),
+        ({"moving": np.zeros((48, 32_767), np.uint8)}, "moving is (48, 32767): images have at most 32766 px a side"),
         ({"moving": IMAGE[None][:0]}, "moving is (0, 64, 64): images have 1 to 16 channels"),
     ],
 )

@@ -13,6 +13,8 @@ from agalign.values.resampling import planes_of, valid_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
+_MAX_SIDE_PX = 32_766
+"""OpenCV resamples no larger images at once."""
 _MAX_MEASURED = 1e15
 """Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20 and more)."""
 _MIN_FILL_SHARE = 0.002
@@ -145,6 +147,10 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     planes, _ = planes_of(image, name)
     if min(planes.shape[1:]) < _MIN_SIDE_PX:
         raise InputError(f"{name} is {planes.shape[1:]}: images need {_MIN_SIDE_PX} px a side")
+    if max(planes.shape[1:]) > _MAX_SIDE_PX:
+        raise InputError(
+            f"{name} is {planes.shape[1:]}: images have at most {_MAX_SIDE_PX} px a side; reduce or cut it"
+        )
     # Sensors deliver 8 or 16 bits: the maximum of a wider type is not saturation.
     is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= 2
     saturation = float(np.iinfo(str(planes.dtype)).max) if is_sensor_type else None
