@@ -24,6 +24,8 @@ MIN_VALID_WEIGHT = 0.999
 """Minimum weight of valid pixels in a valid resampled or reduced pixel: float32 weights do not sum to exactly 1."""
 _MAX_FLOAT32_PX = 1 << 15
 """Positions in images of longer sides need float64: their last bit in float32 is above 0.002 px."""
+_MAX_REMAP_PX = 32_000
+"""OpenCV limits the sides of one image to 32,767 px."""
 NODES_PX = 16
 """Distance of the nodes at which a smooth value, such as an expected error, is calculated."""
 _MAX_CHANNELS = 16
@@ -50,8 +52,12 @@ def between_nodes(nodes: NDArray[np.float32], size_px: Size, tile: Tile) -> Floa
     The nodes are spread evenly over an image (width, height), from corner to corner.
     """
     x, y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in zip(nodes.shape[::-1], size_px, strict=True))
-    at = np.meshgrid(x[tile.x0 : tile.x0 + tile.width], y[tile.y0 : tile.y0 + tile.height])
-    return np.asarray(cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    values = np.empty((tile.height, tile.width), np.float32)
+    for part in tiles(tile, _MAX_REMAP_PX):
+        at = np.meshgrid(x[part.x0 : part.x0 + part.width], y[part.y0 : part.y0 + part.height])
+        in_tile = values[part.y0 - tile.y0 :, part.x0 - tile.x0 :][: part.height, : part.width]
+        in_tile[:] = cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return values
 
 
 def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
@@ -140,7 +146,6 @@ def resample_planes(
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
     """
-    max_source_px = 32_000  # OpenCV limits the sides of one image to 32,767 px
     width, height = size_px
     result = np.empty((len(planes), height, width), planes.dtype)
     result_valid = np.empty((height, width), bool)
@@ -153,7 +158,7 @@ def resample_planes(
         if source is None:
             result[:, *at], result_valid[at] = fill, False
             continue
-        if max(source.width, source.height) > max_source_px:
+        if max(source.width, source.height) > _MAX_REMAP_PX:
             pending += tiles(tile, (max(tile.width, tile.height) + 1) // 2)
             continue
         cut = np.s_[source.y0 : source.y0 + source.height, source.x0 : source.x0 + source.width]

@@ -193,6 +193,14 @@ def test_the_error_on_a_grid_is_that_of_its_pixels(parallax: Parallax | None) ->
         np.testing.assert_allclose(on_grid.on_tile(tile).ravel(), error.error_px(to_reference(at)), rtol=0.02)
 
 
+@pytest.mark.parametrize("size_px", [(40_000, 48), (48, 40_000)])
+def test_the_error_on_a_grid_wider_than_opencv_resamples(size_px: tuple[int, int]) -> None:
+    on_grid = ErrorOnGrid.of(error_of([0.1, 0.5, 0.5, 0.1], None), size_px)
+    width, height = size_px
+    whole, end = on_grid.on_tile(Tile(0, 0, *size_px)), Tile(width - 48, height - 48, 48, 48)
+    np.testing.assert_array_equal(whole[-48:, -48:], on_grid.on_tile(end))
+
+
 @pytest.mark.parametrize("sigma", [1000.0, 10.0])
 def test_the_error_between_images_is_that_between_files(sigma: float) -> None:
     """In px of the file, which are smaller; the noise of peaks too."""
