@@ -82,6 +82,13 @@ def learn_flight(
     )
 
 
+def captures_to_learn_from(captures: Sequence[Capture]) -> list[Capture]:
+    """Return the captures whose images `learn_flight` may read, with the alternatives to those that are not usable."""
+    stretches, others = _stretches_and_others(captures)
+    groups = *stretches, *others, _spread(captures, _rig_captures(captures)), _to_test_a_model(captures)
+    return list({capture.label: capture for group in groups for capture in group}.values())
+
+
 @dataclass(frozen=True)
 class _FlightLearner:
     """The steps of `learn_flight`."""
@@ -170,7 +177,7 @@ class _FlightLearner:
 
     def _observed(self, model: FlightModel) -> list[LearningCapture]:
         """Return two captures, or the only one, aligned by a model without its rig; empty if one of them cannot be."""
-        some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
+        some = _to_test_a_model(self.captures)
         without_rig = replace(portable(model), rig=None)
         tests = list(filter(None, self._from_each(partial(observe_rig, without_rig, self.settings), some)))
         return tests if len(tests) == len(some) else []
@@ -231,9 +238,7 @@ class _FlightLearner:
         `known` are the captures that the network has refined. Those with bands that are not aligned come first, because
         the model's mappings are better initial alignments than seeds.
         """
-        # Neighbours have about the same height and speed.
-        captures_per_rig_capture = 8
-        count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // captures_per_rig_capture))
+        count = _rig_captures(self.captures)
         result = {one.capture.label: one for one in known}
         unaligned = [one.capture for one in known if not one.is_aligned]
         waiting = [*unaligned, *(c for c in _spread(self.captures, count) if c.label not in result)]
@@ -310,6 +315,17 @@ def _stretches_and_others(captures: Sequence[Capture]) -> tuple[list[tuple[Captu
     first = {stretch[0].label for stretch in stretches}
     spread = [c for c in _spread(captures, _MIN_RIG_CAPTURES) if c.label not in first]
     return stretches, [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
+
+
+def _rig_captures(captures: Sequence[Capture]) -> int:
+    """Return the number of captures that the rig is learned from, if the flight has as many."""
+    captures_per_rig_capture = 8  # neighbours have about the same height and speed
+    return min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(captures) // captures_per_rig_capture))
+
+
+def _to_test_a_model(captures: Sequence[Capture]) -> list[Capture]:
+    """Return two captures with which an earlier model is tested, or the only one."""
+    return [captures[k] for k in dict.fromkeys(len(captures) * third // 3 for third in (1, 2))]
 
 
 def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:

@@ -14,7 +14,7 @@ from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
 from agalign.batch.crops import Flight, grids_of_captures
 from agalign.batch.earlier_results import EarlierResults, Remaining
-from agalign.batch.flight_learning import learn_flight
+from agalign.batch.flight_learning import captures_to_learn_from, learn_flight
 from agalign.batch.model_files import ModelFiles
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
@@ -396,7 +396,8 @@ class _FlightRun:
         settings, given = self.settings, self.given
         if not settings.learns_flights:
             return None
-        fingerprint = learning_fingerprint(captures, settings)
+        read = {capture.label for capture in captures_to_learn_from(captures)}
+        fingerprint = learning_fingerprint(captures, settings, read)
         # A run that is stopped before its first capture leaves a model that no sidecar names.
         path = files.find(captures, {fingerprint}) or earlier or files.new(captures)
         with suppress(AgalignError):

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from io import BufferedReader
 from pathlib import Path
@@ -41,14 +41,14 @@ def estimation_fingerprint(capture: Capture, settings: Settings) -> str:
     return _fingerprint(capture, *(stage for key, stage in settings if key not in RENDER_STAGES))
 
 
-def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
-    """Return the hash of everything that the model of a flight depends on.
-
-    Files are compared by `input_samples`.
+def learning_fingerprint(captures: Sequence[Capture], settings: Settings, read: Collection[str]) -> str:
+    """Return the hash of everything that the model of a flight depends on: tags of all captures, and the files of those
+    with the labels `read`, which learning may read.
     """
     stages = settings.joint, settings.seed, settings.flight
-    facts = ((c.label, _fingerprint(c, *stages), sorted(input_samples(c).items())) for c in captures)
-    return hashed(str(flight_camera(captures)), *facts)
+    facts = [(c.label, _fingerprint(c, *stages)) for c in captures]
+    files = [(c.label, sorted(input_digests(c).items())) for c in captures if c.label in read]
+    return hashed(str(flight_camera(captures)), *facts, *files)
 
 
 def render_fingerprint(capture: Capture, write: WriteSettings, check: CheckSettings) -> str:

@@ -219,13 +219,41 @@ def test_radiometry_that_no_capture_has_tags_for_is_refused(flight: Path, tmp_pa
         plan_run(FolderScan(flight, (without,), ()), tmp_path, settings)
 
 
-def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
+def test_a_model_is_learned_again_if_its_input_changed(flight: Path, tmp_path: Path) -> None:
     captures = agalign.discover(flight).captures
-    before = learning_fingerprint(captures, SETTINGS)
-    assert learning_fingerprint(agalign.discover(flight).captures, SETTINGS) == before
+    read = {capture.label for capture in captures}
+    before = learning_fingerprint(captures, SETTINGS, read)
+    assert learning_fingerprint(agalign.discover(flight).captures, SETTINGS, read) == before
     elsewhere = agalign.Settings(flight=agalign.FlightSettings(start_model="another network"))
-    others = (captures[:1], SETTINGS), (captures, elsewhere)
-    assert before not in [learning_fingerprint(*other) for other in others]
+    others = [(captures[:1], SETTINGS), (captures, elsewhere)]
+    copy = shutil.copytree(flight, tmp_path / "flight")
+    with (copy / captures[0].bands[1].path.relative_to(flight)).open("r+b") as file:
+        file.seek(20_000)
+        file.write(b"pixels")  # the size, the start, the middle and the end of the file are as before
+    others.append((agalign.discover(copy).captures, SETTINGS))
+    assert before not in [learning_fingerprint(*other, read) for other in others]
+
+
+@pytest.mark.parametrize("count", [3, 4, 50, 500])
+def test_only_captures_to_learn_from_are_learned_from(
+    flight: Path, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is unusable of them: the model depends on no other images."""
+    (one, *_) = agalign.discover(flight).captures
+    captures = [replace(one, name=f"{number}") for number in range(count)]
+    read: set[str] = set()
+
+    def failed(_: Any, tasks: Sequence[Any], /, **__: object) -> Completed[Any]:
+        for number, task in enumerate(tasks):
+            read.update(capture.label for capture in (task if isinstance(task, tuple) else (task,)))
+            yield number, lambda: None
+
+    model = FlightModel(batch_learn.initial_network(("NIR",), SETTINGS, None), None, ("NIR",), {}, "")
+    learner = batch_learn._FlightLearner(captures, SETTINGS, lambda *_: None, None, failed, 1, None)
+    learner._network()
+    learner._observed(model)
+    learner._observations(model, [])
+    assert read == {capture.label for capture in batch_learn.captures_to_learn_from(captures)}
 
 
 @pytest.mark.full
