@@ -53,8 +53,7 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     elif force not in (None, "structure", *matrices):  # the peaks of other kinds are structure
         return Issue(NO_SUCH_SEED, detail=str(force))
     best = best_seed(pair, matrices, force)
-    # A mapping by the flight or the user or a forced seed excludes other positions.
-    is_given = settings.force is not None or pair.has_rig or "user" in pair.seed_matrices
+    is_given = settings.force is not None or pair.has_rig  # excludes other positions
     # Correlation peak of images that are aligned everywhere. A rotation by 1 degree reduces it to 60 to 120, by 3
     # degrees to 17.
     certain_sigma = 120.0
@@ -64,9 +63,29 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     if not best.trusted and not has_scale:
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
     given = WarpedPair.of(pair, pair.mapping(best.fixed_to_moving))
+    if "user" in pair.seed_matrices:
+        return best if seed_fits(given.residual) else _near_seed_of_user(given, best)
     # The mapping of the tags confirms the image centre, the windows confirm the corners.
     is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(given.residual)
     return best if best.trusted and is_confirmed else _best_match(given, best, is_confirmed=is_confirmed)
+
+
+def _near_seed_of_user(given: WarpedPair, best: Seed) -> Seed:
+    """Return a seed that the windows confirm, where they do not confirm that of the user: its correction by windows, or
+    a match, with no corner farther from it than its standard error allows; itself without either.
+    """
+    pair = given.pair
+    to_given = geometry.invert(pair.seed_matrices["user"])
+
+    def is_near(seed: Seed) -> bool:
+        moved = geometry.compose(to_given, seed.fixed_to_moving)
+        return geometry.corner_error_px(moved, geometry.identity(), *pair.fixed.size_px) <= pair.max_shift_px
+
+    by_windows = corrected(pair, best)
+    if by_windows is not None and is_near(by_windows):
+        return by_windows
+    match = _best_match(given, best, is_confirmed=False)
+    return match if is_near(match) else best
 
 
 def _best_match(given: WarpedPair, best: Seed, *, is_confirmed: bool) -> Seed:

@@ -183,6 +183,22 @@ def test_neither_the_user_s_seed_nor_that_of_a_forced_kind_is_replaced_by_landma
     assert mean_error_px(seed.fixed_to_moving, to_rotated, 400, 320) > 5
 
 
+@pytest.mark.parametrize(
+    ("degrees", "std_px", "is_near"), [(3.0, None, True), (8.0, None, True), (8.0, 20.0, True), (8.0, 10.0, False)]
+)
+def test_a_seed_of_the_user_that_the_windows_do_not_confirm_is_corrected_or_matched(
+    degrees: float, std_px: float | None, is_near: bool
+) -> None:
+    """Within its standard error, if that is known: 8 degrees are 45 px at the corners."""
+    fixed, moving = two_views(np.eye(3), 640, 480)
+    (cos, sin), centre_px = (np.cos(np.radians(degrees)), np.sin(np.radians(degrees))), (319.5, 239.5)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    about_centre = geometry.translation(*centre_px) @ turn @ geometry.translation(*np.negative(centre_px))
+    std = {} if std_px is None else {"user": std_px}
+    seed = find_seed(pair_of(fixed, moving, {"user": about_centre}, **std), SeedSettings())
+    assert (mean_error_px(seed.fixed_to_moving, np.eye(3), 640, 480) < 3) is is_near
+
+
 @pytest.mark.parametrize("is_confirmed", [True, False])
 def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_windows_confirm(
     is_confirmed: bool, monkeypatch: pytest.MonkeyPatch
