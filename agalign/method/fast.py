@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from agalign.errors import GeometryError, NotEnoughTextureError
+from agalign.errors import GeometryError, NoContrastError, NotEnoughTextureError
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.levels import Level, make_level
 from agalign.method.patches import far_apart, patch_positions
@@ -113,12 +113,7 @@ def learn(
     with ThreadPoolExecutor(threads) as pool:
         learner = _Learner(state, net, schedule or SCHEDULES[state.settings.recipe], pool)
         for scale in scales:
-            is_finest = scale == scales[-1]
-            levels = [
-                make_level(own_state, group.fixed, moving, scale)
-                for own_state, group in zip(states, groups, strict=True)
-                if (moving := [m for m in group.moving if m.dropped_at is None and (is_finest or not m.trusted)])
-            ]
+            levels = _levels(states, groups, scale, is_finest=scale == scales[-1])
             if not levels:
                 continue
             if scale == scales[0]:
@@ -129,6 +124,24 @@ def learn(
             for level in levels:
                 _store(level)
     return steps, loss
+
+
+def _levels(
+    states: Sequence[JointState], groups: Sequence[ImageGroup], scale: float, *, is_finest: bool
+) -> list[Level]:
+    """Return the levels of the captures at a scale, without those that have no room for patches there, as between
+    saturated areas. Raises NoContrastError if none has at the finest scale.
+    """
+    levels, error = list[Level](), None
+    for state, group in zip(states, groups, strict=True):
+        moving = [m for m in group.moving if m.dropped_at is None and (is_finest or not m.trusted)]
+        try:
+            levels += [make_level(state, group.fixed, moving, scale)] if moving else []
+        except NoContrastError as without_room:
+            error = without_room
+    if is_finest and not levels and error is not None:
+        raise error
+    return levels
 
 
 def _store(level: Level) -> None:
@@ -187,7 +200,7 @@ class _Learner:
             bands = [band for level in remaining for band in level.bands]
             is_blocked = update > 1 and not all(b.distinguished for b in bands)
             # Steps on psi suffice where retrieval is high enough.
-            needs_no_training = all(b.converged or b.retrieval > self.schedule.enough_retrieval for b in bands)
+            needs_no_training = all(b.converged or (b.retrieval or 0.0) > self.schedule.enough_retrieval for b in bands)
             if is_blocked or (update >= _FIRST_UPDATES and not needs_no_training):
                 return False
         return False

@@ -101,8 +101,8 @@ class LevelBand:
     field: Tensor | None
     """Displacement field (1, 2, rows, columns): px of the level at the nodes of a grid over I, added to positions of I
     before the homography."""
-    retrieval: float = 0.0
-    """Held-out retrieval at the last test."""
+    retrieval: float | None = None
+    """Held-out retrieval at the last test; None without any, as too few patches can be drawn."""
     distinguished: bool = False
     """True once held-out retrieval has reached MIN_RETRIEVAL, which steps on psi require."""
     converged: bool = False

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,16 @@ def test_unrelated_images_are_not_distinguished() -> None:
     assert result.code == "retrieval"
     assert result.value is not None
     assert result.value < 0.1
+
+
+@pytest.mark.parametrize("side_px", [40, 46])
+def test_patches_need_room_at_the_finest_level_only(side_px: int) -> None:
+    """Between saturated areas, reduced images have none, or too few for a test of retrieval."""
+    fixed, moving = two_views(np.eye(3), 640, 480)
+    y, x = np.indices((480, 640)) % (side_px + 8)
+    valid = (y < side_px) & (x < side_px)
+    result = scratch(replace(fixed, valid=valid), replace(moving, valid=valid), np.eye(3), trusted=False)
+    assert result.retrieval > 0.8
 
 
 def test_images_without_contrast_or_overlap_have_an_issue() -> None:
