@@ -210,8 +210,10 @@ class RefinedBand:
         band = self._unchanged_if_aligned
         joint, verified = band.joint, band.verified
         plane = Candidate.of(verified, joint)
-        is_wanted = use == "always" or (use == "auto" and (not self.pair.has_rig or bool(plane.issues)))
-        if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues_of_windows):
+        # Without a rig a field is fitted whatever the costly checks of the pixels find, which check its result too.
+        issues = plane.issues if self.pair.has_rig else plane.issues_of_windows
+        is_wanted = use == "always" or (use == "auto" and (not self.pair.has_rig or bool(issues)))
+        if is_wanted and all(issue.kind in BY_PARALLAX for issue in issues):
             yield from _with_field(plane, verified, joint, is_aligned_input=use == "auto" and band is not self)
         else:
             yield plane

@@ -10,7 +10,7 @@ import pytest
 from agalign.capture import align_bands
 from agalign.capture import candidate as module
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import BandCandidates, RefinedBand, mapping_error
+from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand, mapping_error
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.fit.held_out import chessboard
@@ -22,7 +22,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import ReliefUse
 from agalign.values.geometry import Matrix
-from agalign.values.issues import INACCURATE, REPEATS, RETRIEVAL, Issue
+from agalign.values.issues import INACCURATE, REPEATS, RETRIEVAL, SECOND_LAYER, Issue, IssueKind
 from agalign.values.mapping import DisplacementField
 
 from ..builders import (
@@ -216,6 +216,18 @@ def test_a_field_is_tried_without_a_rig_and_rejected_without_need(
     monkeypatch.setattr(estimator, "refine", recorded)
     plain = aligned(pair, joint_result(), "auto", CENTRED)
     assert (plain.status, plain.geometry, fields) == ("aligned", "homography", [None] * tried)
+
+
+@pytest.mark.parametrize(("kind", "is_tried"), [(SECOND_LAYER, True), (REPEATS, False)])
+def test_with_a_rig_a_field_is_tried_only_where_parallax_may_cause_what_the_pixels_show(
+    kind: IssueKind, is_tried: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(WarpedPair, "issues", (Issue(kind, 20.0),))
+    tried: list[Candidate] = []
+    monkeypatch.setattr(module, "_with_field", lambda plane, *_, **__: tried.append(plane) or iter([plane]))
+    pair = pair_of(*two_views(TRUTH), {"model": TRUTH}, model=1.0)
+    aligned(pair, GOOD, "auto")
+    assert bool(tried) is is_tried
 
 
 def test_issues_that_a_field_cannot_remove_are_reported() -> None:
