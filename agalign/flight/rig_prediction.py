@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -153,22 +153,26 @@ def estimated_factors(
     moved, mean = _at_motion(others, capture.motion)
     if basis == "flight":
         return mean, np.zeros(FACTORS), 0.0
-    known = sorted((c for c in moved if getattr(c, basis) is not None), key=attrgetter(basis))
+    known = [c for c in moved if getattr(c, basis) is not None]
     position = getattr(capture, basis)
     if position is None or not known:
         return None
-    x, factors = np.array([getattr(c, basis) for c in known]), np.array([c.factors for c in known])
+    every = np.array([c.factors for c in known])
+    # Clocks may count whole seconds: captures at the same time, or altitude, are one.
+    x, of_capture, counts = np.unique([getattr(c, basis) for c in known], return_inverse=True, return_counts=True)
+    factors = np.zeros((len(x), FACTORS))
+    np.add.at(factors, of_capture, every / counts[of_capture][:, None])
     place = float(np.interp(position, x, np.arange(len(x))))
     start, end, share = factors[int(place)], factors[min(int(place) + 1, len(x) - 1)], place % 1
     result, std = start + share * (end - start), np.abs(end - start) * np.sqrt(share * (1 - share))
     gap = float(np.abs(x - position).min())
     if len(x) > 1 and not x[0] <= position <= x[-1]:
         first, second = (0, 1) if position < x[0] else (-2, -1)
-        std = np.abs(factors[second] - factors[first]) * gap / max(x[second] - x[first], 1e-9)
+        std = np.abs(factors[second] - factors[first]) * gap / (x[second] - x[first])
     if basis == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
         times_s = sorted(c.seconds for c in others if c.seconds is not None)
         is_near = in_time[2] <= _MAX_GAP_RATIO * max(np.diff(times_s), default=0.0)
-        spread = np.sqrt(np.square(factors - mean).mean(axis=0))
+        spread = np.sqrt(np.square(every - mean).mean(axis=0))
         result[1:], std[1:] = (in_time[0][1:], in_time[1][1:]) if is_near else (mean[1:], spread[1:])
     return result, std, gap
 

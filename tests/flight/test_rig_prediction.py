@@ -124,6 +124,13 @@ def test_factors_are_interpolated_in_time_with_the_error_of_a_brownian_bridge() 
     assert estimated_factors(capture(0.0), known, "seconds") is None
 
 
+def test_captures_at_the_same_time_are_one() -> None:
+    """As by clocks that count whole seconds: no change is divided by the time between them."""
+    known = [capture(float(k), seconds=10.0 * k) for k in range(3)]
+    twice = [*known, capture(4.0, seconds=20.0)]
+    assert distance_at(capture(0.0, seconds=30.0), twice) == pytest.approx((3.0, 2.0, 10.0))
+
+
 def test_the_distance_is_interpolated_in_height_and_the_rest_in_time() -> None:
     known = [capture(2.0 * k, float(k), altitude_m=50.0 + k, steps_px=(float(k), 0.0)) for k in range(3)]
     factors, std, gap = estimated_factors(capture(0.0, 2.0, altitude_m=50.5), known, "altitude_m")
