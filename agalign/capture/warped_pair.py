@@ -116,11 +116,14 @@ class WarpedPair:
     def issues(self) -> tuple[Issue, ...]:
         """What the checks of the pixels find."""
         residual, _ = self._in_usual_windows
-        is_expected = partial(self.pair.is_expected, self.mapping.fixed_to_moving)
+        is_expected, pixel_px = (
+            partial(self.pair.is_expected, self.mapping.fixed_to_moving),
+            self.pair.file_pixel_size_px,
+        )
         return (
-            *content_issues(residual, self.pair.file_pixel_size_px),
-            *layer_issues(self.second_layer),
-            *repetition_issues(self.alias_peaks, is_expected),
+            *content_issues(residual, pixel_px),
+            *layer_issues(self.second_layer, pixel_px),
+            *repetition_issues(self.alias_peaks, is_expected, pixel_px),
         )
 
     @cached_property

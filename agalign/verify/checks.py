@@ -168,6 +168,8 @@ class Layer(NamedTuple):
     """(x, y), px of the fixed image."""
     share: float
     """About how much of the structure."""
+    max_share: float
+    """Largest share that may be noise."""
 
     @property
     def rms_px(self) -> float:
@@ -198,15 +200,15 @@ def second_layer(surface: NDArray[np.float32]) -> Layer | None:
     candidates = np.where(is_near & (distance_px >= min_px), excess, 0)
     row, column = np.unravel_index(int(candidates.argmax()), candidates.shape)
     share = float(candidates[row, column])
-    if not share > max(_MAX_LAYER_SHARE, _MAX_LAYER_NOISE * noise):
-        return None
-    return Layer((float(x[row, column]), float(y[row, column])), share)
+    max_share = max(_MAX_LAYER_SHARE, _MAX_LAYER_NOISE * noise)
+    return Layer((float(x[row, column]), float(y[row, column])), share, max_share) if share > max_share else None
 
 
-def layer_issues(layer: Layer | None) -> Iterator[Issue]:
-    """A second layer, by its share of the structure."""
+def layer_issues(layer: Layer | None, pixel_px: float) -> Iterator[Issue]:
+    """A second layer, by its share of the structure; its shift is in px of the file, `pixel_px` each."""
     if layer is not None:
-        yield Issue(SECOND_LAYER, layer.share, _MAX_LAYER_SHARE, f"{math.hypot(*layer.shift_px):.0f} px")
+        shift_px = math.hypot(*layer.shift_px) / pixel_px
+        yield Issue(SECOND_LAYER, layer.share, layer.max_share, f"{shift_px:.0f} px")
 
 
 def content_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
@@ -311,7 +313,7 @@ def _height_of_repetition(height: int, width: int) -> NDArray[np.float32]:
 
 
 def repetition_issues(
-    aliases: Sequence[AliasPeak], is_expected: Callable[[tuple[float, float]], bool]
+    aliases: Sequence[AliasPeak], is_expected: Callable[[tuple[float, float]], bool], pixel_px: float
 ) -> Iterator[Issue]:
     """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it.
 
@@ -321,7 +323,7 @@ def repetition_issues(
     is_known = is_expected((0.0, 0.0))
     for alias in aliases:
         if not is_known or is_expected(alias.shift_px):
-            yield Issue(REPEATS, math.hypot(*alias.shift_px))
+            yield Issue(REPEATS, math.hypot(*alias.shift_px) / pixel_px)
             return
 
 

@@ -312,7 +312,7 @@ def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded(
     aliases = alias_peaks(spectrum, spectrum, PixelScale(0.5, 0.25))
     x_px, y_px = aliases[0].shift_px
     assert (abs(x_px) % 16, y_px, x_px == 0) == (0, 0, False)
-    issues = list(repetition_issues(aliases, lambda shift_px: float(np.hypot(*shift_px)) <= expected_within_px))
+    issues = list(repetition_issues(aliases, lambda shift_px: float(np.hypot(*shift_px)) <= expected_within_px, 1.0))
     assert [issue.code for issue in issues] == codes
     assert all(issue.value == pytest.approx(abs(x_px)) for issue in issues)
 
@@ -320,9 +320,9 @@ def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded(
 def test_an_expected_alias_is_an_issue_also_if_a_higher_one_is_not_expected() -> None:
     """As in rows with a lattice of plants: the next plant is far from the seed, the next row is not."""
     aliases = [AliasPeak((-32.0, 0.0), 0.93), AliasPeak((0.0, 14.0), 0.82)]
-    (issue,) = repetition_issues(aliases, lambda shift_px: np.hypot(*shift_px) <= 15)
-    assert (issue.code, issue.value) == ("repeats", 14.0)
-    assert list(repetition_issues(aliases[:1], lambda shift_px: np.hypot(*shift_px) <= 15)) == []
+    (issue,) = repetition_issues(aliases, lambda shift_px: np.hypot(*shift_px) <= 15, 0.5)
+    assert (issue.code, issue.value) == ("repeats", 28.0), "px of a file of twice the size"
+    assert list(repetition_issues(aliases[:1], lambda shift_px: np.hypot(*shift_px) <= 15, 0.5)) == []
     rng = np.random.default_rng(0)
     lattice = np.tile(rng.normal(size=(16, 16)), (4, 4)) + 0.1 * np.tile(rng.normal(size=(64, 16)), (1, 4))
     spectrum = np.fft.fft2(lattice).astype(np.complex64)
@@ -362,8 +362,17 @@ def test_strips_that_are_displaced_within_the_windows_are_a_second_layer(shift_p
     layer = layer_in(-np.where(ROWS, displaced, SCENE))
     assert 0.2 < layer.share < 0.5
     assert np.dot(layer.shift_px, shift_px) > 0.9 * np.hypot(*layer.shift_px) * np.hypot(*shift_px)
-    (issue,) = layer_issues(layer)
-    assert issue.code == "second_layer"
+    (issue,) = layer_issues(layer, 0.5)
+    assert (issue.code, issue.limit) == ("second_layer", layer.max_share)
+    assert issue.detail == f"{2 * np.hypot(*layer.shift_px):.0f} px", "of a file of twice the size"
+
+
+def test_noise_raises_the_limit_of_a_second_layer() -> None:
+    displaced = cv2.warpAffine(SCENE, geometry.translation(0.0, -5.0)[:2], SCENE.shape[::-1], flags=cv2.INTER_CUBIC)
+    layers = np.where(ROWS, displaced, SCENE)
+    noise = np.random.default_rng(0).normal(0, 0.3 * SCENE.std(), SCENE.shape)
+    assert layer_in(layers).share > layer_in(layers).max_share
+    assert layer_in(layers + noise).max_share > layer_in(layers).max_share
 
 
 def test_one_layer_is_symmetric_whatever_it_shows() -> None:
