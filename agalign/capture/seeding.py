@@ -248,7 +248,7 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
         return [Seed(kind, fixed_to_moving, 0.0)]
 
     def seed(kind: SeedKind, matrix: Matrix, sigma: float, runner_up: float) -> Seed:
-        min_sigma = 12.0  # for an error of a few pixels; unrelated images have up to 9
+        min_sigma = 12.0  # unrelated images have up to 9
         min_ratio = 1.5  # a repetitive scene has several similar peaks
         is_trusted = sigma >= max(min_sigma, min_ratio * runner_up)
         return Seed(kind, matrix, sigma, sigma, runner_up, is_trusted)

@@ -212,7 +212,7 @@ def make_level(state: JointState, fixed: Raster, moving: Sequence[MovingImage], 
     has_texture = (gradient > min_gradient_per_px) & (fixed_view.clearance_px.cpu().numpy() > FOOTPRINT_PX)
     trainable, held_out = (
         _pool(has_texture, max_radius_px, fixed_view.lens, state)
-        for max_radius_px in _max_radius_in_cells(*fixed_view.size_px)
+        for max_radius_px in _training_and_held_out_radii(*fixed_view.size_px)
     )
     if len(trainable) == 0:
         raise NoContrastError
@@ -260,7 +260,7 @@ def _gradient_magnitude(planes: FloatImage) -> FloatImage:
 
 
 @lru_cache(maxsize=2)
-def _max_radius_in_cells(width_px: int, height_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _training_and_held_out_radii(width_px: int, height_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return, for the training cells and for the held-out cells, (height, width) px distances to the cells of the
     other kind; 0 in the cells of the other kind.
     """

@@ -27,7 +27,7 @@ class MovingImage:
     side: int = 1
     """Side of the network that describes it."""
     trusted: bool = False
-    """True for a seed with an error of a few pixels, for which recipe fast skips the coarse levels."""
+    """True for a seed that is likely to be right to a few pixels, for which recipe fast skips the coarse levels."""
     max_shift_px: float = math.inf
     """Maximum shift from the seed in the search at the coarsest level, px of the fixed image."""
     field: DisplacementField | None = None

@@ -73,8 +73,8 @@ class Seed:
     runner_up_sigma: Number = 0.0
     """Height of the second highest separate peak, in standard deviations."""
     trusted: bool = False
-    """The images confirm it to a few pixels, or it is that of tags or flight and replaced a seed that contradicts it.
-    """
+    """The images have a clear correlation peak there, which shows the shift of the centre rather than that of the
+    corners, or windows confirm it; or it is that of tags or flight and replaced a seed that contradicts it."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
@@ -131,7 +131,9 @@ class JointResult:
 
     @property
     def min_retrieval(self) -> float:
-        """The retrieval of held-out patches from which the descriptors distinguish them, 0 to 1."""
+        """The retrieval of held-out patches from which the descriptors distinguish them; above 1 where too few are visible
+        for a test.
+        """
         return max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * self.chance)
 
     @property
