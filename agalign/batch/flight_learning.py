@@ -308,7 +308,7 @@ def _stretches_and_others(captures: Sequence[Capture]) -> tuple[list[tuple[Captu
     The network is learned from the middle of each stretch of the flight, or from its start or end.
     """
     # Each capture takes seconds. A third one mostly shows the structure that two lack.
-    parts = np.array_split(np.arange(len(captures)), 3)
+    parts = np.array_split(np.arange(len(captures)), min(3, len(captures)))
     places = [dict.fromkeys(part[[len(part) // 2, 0, -1]].tolist()) for part in parts]
     stretches = [tuple(captures[i] for i in of_part) for of_part in places]
     # Refined at the same time as those of the network, the others occupy all workers.

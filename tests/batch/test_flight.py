@@ -234,7 +234,7 @@ def test_a_model_is_learned_again_if_its_input_changed(flight: Path, tmp_path: P
     assert before not in [learning_fingerprint(*other, read) for other in others]
 
 
-@pytest.mark.parametrize("count", [3, 4, 50, 500])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 50, 500])
 def test_only_captures_to_learn_from_are_learned_from(
     flight: Path, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
