@@ -78,16 +78,14 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
     match node:
         case ast.Name(id=name):
             return values[name]
-        case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
+        case ast.Constant(value=int() | float() as value) if abs(value) < max_number and not isinstance(value, bool):
             # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
             return np.float32(value)
-        case ast.BinOp(left, ast.Div(), ast.BinOp(base, ast.Pow(), right)) if _is_number(right):
-            return _value(left, values) / _divisor(base, _value(right, values), values)
         case ast.BinOp(left, ast.Div(), right):
-            return _value(left, values) / _divisor(right, np.float32(1), values)
+            return _value(left, values) / _divisor(right, values)
         case ast.BinOp(base, ast.Pow(), right) if _is_number(right):
             power = _value(right, values)
-            return np.float32(1) / _divisor(base, -power, values) if power < 0 else _value(base, values) ** power
+            return np.float32(1) / _divisor(base, values, -power) if power < 0 else _value(base, values) ** power
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
@@ -105,30 +103,45 @@ def _is_number(node: ast.expr) -> bool:
     return not any(isinstance(part, ast.Name) for part in ast.walk(node))
 
 
-def _divisor(base: ast.expr, power: Any, values: Mapping[str, FloatImage]) -> Any:
-    """Return the value of the denominator base ** power.
-
-    If it has bands, it is nan where it is not positive, and where its base is not beyond the noise of its terms.
+def _divisor(node: ast.expr, values: Mapping[str, FloatImage], power: Any = 1) -> Any:
+    """Return the value of a power of a denominator. If it has bands, it is nan where it is not positive, not finite, or
+    near zero.
     """
-    value, magnitude = _sum(base, values)
+    value, _, is_certain = _parts(node, values)
     divisor = value**power
-    if _is_number(base):
+    if _is_number(node):
         return divisor
-    is_certain = (np.abs(value) > _NOISE * magnitude) & (divisor > 0)
-    return np.where(is_certain, divisor, np.float32(np.nan))
+    return np.where(is_certain & (divisor > 0) & (divisor < np.inf), divisor, np.float32(np.nan))
 
 
-def _sum(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any]:
-    """Return the value of a sum, and the sum of the absolute values of its terms.
+def _parts(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any, Any]:
+    """Return the value of a part of a denominator, the sum of the absolute values of its terms, with sums in products
+    multiplied out, and True where all factors of the part are beyond the noise of their terms.
 
-    Each term is calculated once: the time of nested denominators would otherwise double with each level.
+    Each part is calculated once: the time of nested denominators would otherwise double with each level.
     """
     match node:
         case ast.BinOp(left=left, op=(ast.Add() | ast.Sub()) as op, right=right):
-            one, other = _sum(left, values), _sum(right, values)
-            return _OPERATORS[type(op)](one[0], other[0]), one[1] + other[1]
+            one, other = _parts(left, values), _parts(right, values)
+            value, magnitude = _OPERATORS[type(op)](one[0], other[0]), one[1] + other[1]
+            return value, magnitude, np.abs(value) > _NOISE * magnitude
+        case ast.BinOp(left, ast.Mult(), right):
+            one, other = _parts(left, values), _parts(right, values)
+            return one[0] * other[0], one[1] * other[1], one[2] & other[2]
+        case ast.BinOp(left, ast.Div(), right):
+            one, divisor = _parts(left, values), _divisor(right, values)
+            return one[0] / divisor, one[1] / np.abs(divisor), one[2]
+        case ast.BinOp(base, ast.Pow(), right) if _is_number(right) and (power := _value(right, values)) >= 0:
+            value, magnitude, is_certain = _parts(base, values)
+            return value**power, magnitude**power, is_certain
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+            value, magnitude, is_certain = _parts(operand, values)
+            return _OPERATORS[type(op)](value), magnitude, is_certain
+        case ast.Call(func=ast.Name(id="abs" | "sqrt" as name), args=[argument], keywords=[]):
+            value, magnitude, is_certain = _parts(argument, values)
+            return _FUNCTIONS[name](value), _FUNCTIONS[name](magnitude), is_certain
     value = _value(node, values)
-    return value, np.abs(value)
+    return value, np.abs(value), np.bool_(True)
 
 
 @dataclass(frozen=True)

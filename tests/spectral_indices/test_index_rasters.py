@@ -42,7 +42,7 @@ from ..program import agalign_here
 from ..run_outputs import aligned, context_of, index_of, indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
-sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
+sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R\nN*True"""
 
 
 def test_the_index_before_alignment_is_that_of_the_files(tmp_path: Path) -> None:
@@ -126,6 +126,26 @@ def test_a_formula_has_the_value_of_its_arithmetic() -> None:
     assert [evaluate(tower, {"N": n}).shape for tower in towers] == [n.shape] * 3, "and these take none either"
     golden_ratio = evaluate("1/(1+" * 40 + "N" + ")" * 40, {"N": n})
     np.testing.assert_allclose(golden_ratio[0, ::2], (5**0.5 - 1) / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "denominator",
+    [
+        *("N-R", "0.5*N-0.5*R", "2*(N-R)", "(N-R)/2", "-(R-N)", "+(N-R)", "abs(N-R)", "abs(R-N)", "sqrt(N-R)"),
+        *("(N-R)*(N+R)", "(N-R)/(N+R)", "(N-R)**2", "R+2*(N-R)-N", "1/(1/(N-R))"),
+    ],
+)
+def test_a_denominator_near_zero_has_no_value_however_it_is_written(denominator: str) -> None:
+    """The difference of N and R is 0.1 % of their sum in the first pixel, and 25 % in the second."""
+    n, r = np.float32([[0.5, 0.5]]), np.float32([[0.499, 0.3]])
+    assert np.isfinite(evaluate(f"1/({denominator})", {"N": n, "R": r})).tolist() == [[False, True]]
+
+
+def test_a_factor_of_a_denominator_is_compared_with_its_own_terms() -> None:
+    """A product of differences of 10 % is not near zero, and infinite denominators have no value."""
+    values = {"N": np.float32([[0.55]]), "R": np.float32([[0.45]])}
+    finite = [np.isfinite(evaluate(text, values)).all() for text in ("1/((N-R)*(N-R))", "1/(N-R)**2", "1/exp(N*999)")]
+    assert finite == [True, True, False]
 
 
 def test_the_catalogue_gives_names_and_constants() -> None:
