@@ -9,7 +9,6 @@ import signal
 import tomllib
 from collections.abc import Iterator
 from functools import cache
-from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -122,15 +121,24 @@ def calls(module: str, function: str) -> Iterator[ast.Call]:
             yield node
 
 
-def test_events_of_a_run_and_their_fields() -> None:
+def listed_events() -> dict[str, str]:
+    """The fields of each event, as the page states them."""
+    entries = re.findall(r"^\* (`.*?): (.+(?:\n  .+)*)", text_of(ROOT / "docs" / EXIT_CODES), re.MULTILINE)
+    return {event: text for events, text in entries for event in re.findall(r"`(\w+)`", events)}
+
+
+def test_events_of_all_commands_and_their_fields() -> None:
     fields: dict[str, set[str]] = {}
-    for call in chain(calls("cli/align_run.py", "event"), calls("cli/terminal.py", "event")):
-        if isinstance(call.args[0], ast.Constant):
-            names = {k.arg for k in call.keywords if k.arg is not None}
-            fields.setdefault(str(call.args[0].value), set()).update(names)
-    listed = {row[0].strip("`"): set(re.findall(r"`(\w+)`", row[1])) for row in table(EXIT_CODES, "event")}
-    # Their names are in a loop; a problem is an event of the terminal.
-    assert set(listed) == {*fields, "panel", "sky", "problem"}
+    modules = [str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py")]
+    for module in modules:
+        events = [(call.args[0], call) for call in calls(module, "event")]
+        events += [(ast.Constant("problem"), call) for call in calls(module, "problem") if call.keywords]
+        for name, call in events:
+            if isinstance(name, ast.Constant):
+                names = {k.arg for k in call.keywords if k.arg is not None}
+                fields.setdefault(str(name.value), set()).update(names)
+    listed = {event: set(re.findall(r"`(\w+)`", text)) for event, text in listed_events().items()}
+    assert set(listed) == {*fields, "panel", "sky"}  # these two have their names from a loop
     for event, names in fields.items():
         assert names <= listed[event], event
 
@@ -142,8 +150,8 @@ def test_stages_of_a_capture() -> None:
         for name in ("progress", "report"):
             for call in calls(str(path.relative_to(PACKAGE)), name):
                 stages |= {str(a.value) for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
-    row = next(row for row in table(EXIT_CODES, "event") if row[0] == "`stage`")
-    assert set(re.findall(r"`(\w+)`", row[1].partition("`stage` (")[2].partition(")")[0])) == stages - {""}
+    listed = listed_events()["stage"].partition("`stage` (")[2].partition(")")[0]
+    assert set(re.findall(r"`(\w+)`", listed)) == stages - {""}
 
 
 LIMITS = {
@@ -208,9 +216,9 @@ def test_equations_of_the_paper() -> None:
 
 def test_extras() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    assert {name for row in table("tutorial/install.md", "extra") for name in re.findall(r"`(\w+)`", row[0])} == set(
-        extras
-    )
+    listed = text_of(ROOT / "docs/tutorial/install.md").partition("\nExtras (MB):\n\n")[2].partition("\n\n")[0]
+    names_of_entries = [re.split("[(:]", entry)[0] for entry in listed.splitlines()]
+    assert {name for names in names_of_entries for name in re.findall(r"`(\w+)`", names)} == set(extras)
     commands = re.findall(r"pip install '?\.\[([\w,]+)\]", "".join(page.read_text(encoding="utf-8") for page in PAGES))
     assert commands
     assert {name for names in commands for name in names.split(",")} <= set(extras)
