@@ -180,12 +180,12 @@ def _sign(gps: Mapping[str, Any], axis: str, letters: str) -> int | None:
 
 
 def _altitude_m(gps: Mapping[str, Any]) -> float | None:
-    """Altitude above sea level, negative with the reference 1; None if it is missing or impossible."""
+    """Altitude, negative below the ellipsoid or sea level (1, 3 in Exif 3.0); None if it is missing or impossible."""
     max_altitude_m = 20_000.0  # beyond it tags are damaged
     altitude_m = finite(gps.get("GPSAltitude"))
     if altitude_m is None or abs(altitude_m) > max_altitude_m:
         return None
-    return -altitude_m if gps.get("GPSAltitudeRef") == b"\x01" else altitude_m
+    return -altitude_m if gps.get("GPSAltitudeRef") in (b"\x01", b"\x03") else altitude_m
 
 
 def _mean(value: Any) -> float | None:

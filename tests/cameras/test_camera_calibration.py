@@ -428,6 +428,15 @@ def test_a_coordinate_of_zero_is_missing(images: Path, axis: int) -> None:
     assert only(discover(images)).position is None
 
 
+@pytest.mark.parametrize(("reference", "sign"), [(0, 1), (1, -1), (2, 1), (3, -1)])
+def test_the_sign_of_an_altitude_is_that_of_its_reference(images: Path, reference: int, sign: int) -> None:
+    """0 and 1: above and below the ellipsoid (until Exif 2.3: sea level), 2 and 3: above and below sea level."""
+    altitude_m = only(discover(images)).position.altitude_m
+    for path in images.iterdir():
+        changed(path, gps={GPS_TAG.GPSAltitudeRef: Entry(1, 1, bytes([reference]))})
+    assert only(discover(images)).position.altitude_m == sign * altitude_m != 0
+
+
 @pytest.mark.parametrize(
     ("tags", "of_pix4d", "named"),
     [
