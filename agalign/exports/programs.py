@@ -4,11 +4,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from agalign.cameras import pix4d
 from agalign.cameras.image_file import natural_order
-from agalign.cameras.metadata import read_tags
+from agalign.cameras.metadata import Tags, read_tags
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.host.files import (
     check_inside,
@@ -164,16 +165,26 @@ def _notes(program: ExportProgram, captures: Sequence[RunCapture], files: Sequen
 
 
 def _without_radiometry(files: Sequence[Path]) -> dict[str, str]:
-    """The option of OpenDroneMap for files that agalign did not convert. It reads the horizontal irradiance of a light
-    sensor under this name, and without its unit as W / m^2 / nm; other irradiances are not in the unit of its radiance.
-    """
+    """The option of OpenDroneMap for files that agalign did not convert."""
     with BandReader() as reader:
         if UNSTATED in reader.units(AlignedBand("", None, files[0], 1)):
             contents = f"numbers whose unit is {UNSTATED}: OpenDroneMap must not calibrate them."
             return {"calibration": "none", "contents": contents}
-    names = (pix4d.NAMESPACE, "HorizontalIrradiance"), (pix4d.NAMESPACE, "IrradianceScaleToSIUnits")
-    tags = (read_tags(path) for path in files)
-    if all(t.number(*name) for t in tags for name in names if t.text(pix4d.NAMESPACE, "BandName") != "LWIR"):
+    if all(_has_light(read_tags(path)) for path in files):
         return {"calibration": "camera+sun", "contents": "raw numbers, and the irradiance of the light sensor."}
-    contents = "raw numbers, not all with a horizontal irradiance; align with --radiometry for reflectance."
+    contents = "raw numbers, not all with an irradiance for OpenDroneMap; align with --radiometry for reflectance."
     return {"calibration": "camera", "contents": contents}
+
+
+def _has_light(tags: Tags) -> bool:
+    """True for a thermal band, and for one with an irradiance by which OpenDroneMap divides the radiance.
+
+    That is the horizontal irradiance of a light sensor, without the tag of its unit as W / m^2 / nm, or for DJI the
+    irradiance, which fits DJI's relative radiance. Other irradiances are not in the unit of the radiance.
+    """
+    number = partial(tags.number, pix4d.NAMESPACE)
+    if tags.text(pix4d.NAMESPACE, "BandName") == "LWIR":
+        return True
+    if tags.make == "DJI" and (number("SpectralIrradiance") or number("Irradiance")):
+        return True
+    return bool(number("HorizontalIrradiance") and number("IrradianceScaleToSIUnits"))

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 import agalign
+from agalign.cameras.pix4d import NAMESPACE
+from agalign.cameras.tiff_directory import XMP, add_directories, byte_string, text
 from agalign.cli.terminal import ExitCode
 from agalign.exports.programs import _without_radiometry, export
 from agalign.records.sidecar_file import find_sidecars
 from agalign.values.choices import ExportProgram
 
+from ..cameras.test_vendors import packet
 from ..conftest import Shared, read_json, seeded, write_band, write_signed
 from ..program import agalign_here
 from ..run_outputs import change
@@ -65,6 +68,26 @@ def test_numbers_that_may_be_reflectance_are_not_calibrated_again(tmp_path: Path
     for factor, calibration in ((0.5, "none"), (6000.0, "camera")):
         write_band(tmp_path / "a.tif", np.full((64, 80), factor, np.float32))
         assert _without_radiometry([tmp_path / "a.tif"])["calibration"] == calibration
+
+
+@pytest.mark.parametrize(
+    ("make", "tags", "calibration"),
+    [
+        ("DJI", {"Irradiance": "5000"}, "camera+sun"),  # OpenDroneMap divides DJI's radiance by this tag
+        ("MicaSense", {"Irradiance": "0.8"}, "camera"),
+        ("MicaSense", {"HorizontalIrradiance": "80"}, "camera"),
+        ("MicaSense", {"HorizontalIrradiance": "80", "IrradianceScaleToSIUnits": "0.01"}, "camera+sun"),
+        ("MicaSense", {"BandName": "LWIR"}, "camera+sun"),
+    ],
+)
+def test_odm_calibrates_by_the_irradiances_that_it_reads(
+    make: str, tags: dict[str, str], calibration: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.tif"
+    write_band(path, np.full((64, 80), 6000, np.uint16))
+    xmp = packet({(NAMESPACE, name): (value,) for name, value in tags.items()}, "elements")
+    add_directories(path, {271: text(make), XMP: byte_string(xmp)}, {}, {})
+    assert _without_radiometry([path])["calibration"] == calibration
 
 
 def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path) -> None:
