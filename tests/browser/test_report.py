@@ -494,6 +494,13 @@ def test_no_table_is_cut_off(browser: Any, out: Path, tmp_path: Path, width: int
     page.close()
 
 
+def test_the_map_continues_across_the_180th_meridian(page: Any) -> None:
+    call = "inMetres([179.9999, -179.9999, -179.9998].map((longitude) => ({ position: [0, longitude] })))"
+    result = page.evaluate(call)
+    assert [round(x) for x, _ in result["metres"]] == [-19, 4, 15]
+    assert result["reach"][0] == pytest.approx(18.6, abs=0.1)
+
+
 def test_the_map_leads_to_the_captures(page: Any) -> None:
     dots = page.locator("#map circle")
     assert dots.count() == 2, "one has no position"

@@ -35,11 +35,13 @@ function drawMap() {
 }
 
 /**
- * The positions of captures, metres to the east and north of their centre, and the largest of them.
+ * The positions of captures, metres to the east and north of their centre, and the largest of them. Longitudes continue
+ * across the 180th meridian.
  * @param {Row[]} placed
  */
 function inMetres(placed) {
-  const positions = placed.map((row) => row.position ?? [0, 0]);
+  const first = placed[0].position?.[1] ?? 0;
+  const positions = placed.map((row) => row.position ?? [0, 0]).map(([lat, lon]) => [lat, lon + 360 * Math.round((first - lon) / 360)]);
   const centre = [0, 1].map((i) => positions.reduce((sum, position) => sum + position[i], 0) / placed.length);
   const metres = positions.map(([lat, lon]) => [(lon - centre[1]) * 111320 * Math.cos((centre[0] * Math.PI) / 180), (lat - centre[0]) * 110540]);
   const reach = [0, 1].map((i) => metres.reduce((largest, m) => Math.max(largest, Math.abs(m[i])), 1e-9));
