@@ -403,7 +403,7 @@ def _run(
 @checked
 def indices(
     out: str | Path,
-    names: Sequence[str] = ("ndvi",),
+    names: Sequence[str] | None = None,
     *,
     formulas: Sequence[str] = (),
     target: str | Path | None = None,
@@ -419,7 +419,7 @@ def indices(
     out
         Output folder of a run.
     names
-        Names of indices, such as ndvi or ndre; `agalign indices --help` lists them.
+        Names of indices, such as ndvi or ndre. By default ndvi, or none with `formulas`.
     formulas
         Further indices as "name=formula", such as "mine=(N-RE)/(N+RE)", of the bands B, G, R, RE and N.
     target

@@ -157,7 +157,7 @@ def _indices(
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics.
 
     Options:
-        index: Names separated by commas: ndvi (the default), ndre, savi …
+        index: Names separated by commas: ndvi (by default, without --formula), ndre, savi …
         formula: A formula of the bands B, G, R, RE and N, such as 'name=(N-R)/(N+R)'; repeatable.
         target: Folder for the rasters; by default next to the stacks.
         mask_qa: Omit saturated, occluded and misaligned pixels, also of finished indices; the run needs --qa.
@@ -173,7 +173,7 @@ def _indices(
     from agalign.spectral_indices.formulas import chosen_indices
 
     folder, run = target or out, given["run"]
-    chosen = chosen_indices(names_in(index or ("" if formula else "ndvi")), formula or [])
+    chosen = chosen_indices(names_in(index) if index else None, formula or [])
     tasks = index_tasks(out, chosen, folder, overwrite=run["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
     reports, problems = _run_indices(tasks, folder, terminal, run["jobs"], run["executor"])

@@ -198,8 +198,13 @@ INDICES: Mapping[str, Index] = {
 }
 
 
-def chosen_indices(names: Sequence[str], formulas: Sequence[str] = ()) -> list[Index]:
-    """Return the indices of names and formulas. Raises ConfigurationError for an unknown or a repeated one."""
+def chosen_indices(names: Sequence[str] | None, formulas: Sequence[str] = ()) -> list[Index]:
+    """Return the indices of names and formulas; without either, if `names` is None, that is ndvi.
+
+    Raises ConfigurationError for an unknown or a repeated one.
+    """
+    if names is None:
+        names = () if formulas else ("ndvi",)
     chosen = [index_named(name) for name in names] + [index_of_formula(f) for f in formulas]
     repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
     if repeated:

@@ -17,7 +17,7 @@ from agalign.values.choices import ExportProgram
 from ..cameras.test_vendors import packet
 from ..conftest import Shared, read_json, seeded, write_band, write_signed
 from ..program import agalign_here
-from ..run_outputs import change
+from ..run_outputs import change, table_in
 
 pytestmark = pytest.mark.slow
 
@@ -60,6 +60,9 @@ def test_python_exports_and_computes_indices_as_the_commands(run: Path, aligned_
     for folder in ("by_python", "by_command"):
         (path, *_) = sorted((tmp_path / folder).rglob("*_ndvi.tif"))
         assert path.read_bytes() == next((tmp_path / "by_command").rglob(path.name)).read_bytes()
+    of_formulas = agalign.indices(aligned_flight, formulas=["a=N/R"], target=tmp_path / "a")
+    assert agalign_here("indices", aligned_flight, "--formula", "a=N/R", "-o", tmp_path / "b").returncode == ExitCode.OK
+    assert {r.index for r in of_formulas} == {row["index"] for row in table_in(tmp_path / "b" / "indices.csv")} == {"a"}
     with pytest.raises(agalign.ConfigurationError, match="'ndvi' is given twice"):
         agalign.indices(run, ["ndvi", "NDVI"])
 
