@@ -67,8 +67,8 @@ class Option:
     """Its default; by default that of the field, if `type` is that of the field."""
     parse: Callable[[Any], Any] = lambda value: value
     """Returns the value of the field for that of the option."""
-    alone: str = ""
-    """Its value if it is given without one."""
+    alone: tuple[str, ...] = ()
+    """Its value if it is given without one, as for True, and its value for False."""
     path: tuple[str, ...] = ()
     """Names of the model (settings, discover or run), of the stage, if any, and of the field."""
     info: Mapping[str, Any] = field(default_factory=dict)
@@ -79,6 +79,10 @@ class Option:
         """Its long name, with its dashes."""
         return f"--{self.name.replace('_', '-')}"
 
+    def value_of(self, value: Any) -> Any:
+        """Return the value that True or False stands for, if the option may be given alone; else the value itself."""
+        return self.alone[not value] if self.alone and isinstance(value, bool) else value
+
 
 def option_of(name: str, of_field: FieldInfo) -> Option:
     """Return the option that the annotation of a field describes."""
@@ -86,12 +90,8 @@ def option_of(name: str, of_field: FieldInfo) -> Option:
     return replace(option, name=option.name or name)
 
 
-def _yes_or_no(yes: str, no: str) -> BeforeValidator:
-    """Accept True and False for two values of a setting."""
-    return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
-
-
 _OPTIONS = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True)
+_RELIEF, _RADIOMETRY = Option("relief", alone=("always", "never")), Option(alone=("auto", "off"))
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()))
 
 
@@ -272,7 +272,7 @@ class ReliefSettings(SettingsModel):
 
     # A single moving lens gets a smooth displacement field instead, if left-out windows confirm it: no other band can
     # verify its relief.
-    use: Annotated[choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always")] = "auto"
+    use: Annotated[choices.ReliefUse, BeforeValidator(_RELIEF.value_of), _RELIEF] = "auto"
     """Correct parallax (trees, terraces, close range) by a parallax map or a displacement field: always, never, or if
     the windows show parallax (auto). --relief alone means always."""
 
@@ -333,7 +333,7 @@ class WriteSettings(SettingsModel):
     """Add confidence and range (m) to <capture>.relief.tif."""
     fill_occluded: bool = False
     """Interpolate occluded pixels; by default they are nodata."""
-    radiometry: Annotated[choices.RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
+    radiometry: Annotated[choices.RadiometryChoice, BeforeValidator(_RADIOMETRY.value_of), _RADIOMETRY] = "off"
     """Convert raw numbers to radiance (camera), or to reflectance by the light sensor (sun) or by a calibration panel
     and the light sensor, if any (panel). auto, or --radiometry alone: the first that all bands have of panel with
     light sensor, sun, panel alone, camera. Thermal bands become degrees C."""

@@ -231,5 +231,5 @@ def _completed(args: list[str], option: "Option") -> list[str]:
         # A word that is neither an option nor a path is a misspelt choice.
         is_value = following in get_args(option.type) or (following.isalnum() and not os.path.exists(following))  # noqa: PTH110 - Path raises OSError for a long name
         if argument == option.flag and not is_value:
-            result.append(option.alone)
+            result.append(option.alone[0])
     return result

@@ -6,6 +6,7 @@ from typing import Any
 
 import typer
 
+from agalign.cli.command import field_options
 from agalign.host.files import path_problem, read_regular
 from agalign.host.text import did_you_mean
 
@@ -13,8 +14,8 @@ from agalign.host.text import did_you_mean
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """Use the values of a TOML file (`--config agalign.toml`) as defaults of the command's options.
 
-    Its keys are the long options without the leading dashes. The command line takes precedence. Raises BadParameter for
-    a file that is not TOML, and for an unknown key.
+    Its keys are the long options without the leading dashes; true is an option without a value. The command line takes
+    precedence. Raises BadParameter for a file that is not TOML, and for an unknown key.
     """
     if path is None:
         return None
@@ -26,7 +27,8 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         name = key.replace("_", "-")
         if name not in options:
             raise typer.BadParameter(f"{path}: no option '{key}'{did_you_mean(name, options)}")
-        option = options[name]
+        option, of_field = options[name], field_options().get(name.replace("-", "_"))
+        value = of_field.value_of(value) if of_field else value
         values = value if isinstance(value, list) and option.multiple else [value]
         if isinstance(value, (dict, list)) and values is not value:
             raise typer.BadParameter(f"{path}: '{key}' takes one value")

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from synthetic_flights.aligned import make_aligned
 
+import agalign
 from agalign.cli import main
 from agalign.errors import OutputError
 from agalign.synthetic import flight as synthetic
@@ -102,6 +103,18 @@ def test_any_value_of_any_option_is_taken_or_one_line(tmp_path: Path) -> None:
         assert (done.stdout + done.stderr).replace("\n", "").isprintable(), config.read_text()
         assert "please report" not in done.stderr, config.read_text()
     assert set(tmp_path.iterdir()) == {config, tmp_path / "in"}
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_true_and_false_are_those_of_python(value: bool, tmp_path: Path) -> None:
+    config = tmp_path / "agalign.toml"
+    config.write_text(f"radiometry = {str(value).lower()}\nrelief = {str(value).lower()}\n")
+    of_file = parameters("align", "x", "--config", config)
+    in_python = agalign.WriteSettings(radiometry=value).radiometry, agalign.ReliefSettings(use=value).use
+    assert (of_file["radiometry"], of_file["relief"]) == in_python
+    if value:
+        alone = parameters("align", "x", "--radiometry", "--relief")
+        assert (alone["radiometry"], alone["relief"]) == in_python
 
 
 def test_the_printed_file_has_every_option_and_changes_nothing(tmp_path: Path) -> None:
