@@ -115,11 +115,11 @@ class Packet:
 
     def add(self, name: Name, value: str) -> None:
         """Add or replace a value, in a namespace that the packet already uses; else nothing is changed."""
-        self.remove([name])
         for description in self._descriptions():
             for tag in [*description.attrib, *(child.tag for child in description)]:
                 uri, _, _ = tag.removeprefix("{").rpartition("}")
                 if name[0] in _namespaces(uri):
+                    self.remove([name])
                     etree.SubElement(description, f"{{{uri}}}{name[1]}").text = value
                     return
 

@@ -42,6 +42,15 @@ def test_namespaces_are_places_whatever_their_version_and_slash(uri: str) -> Non
     assert values[NAMESPACE, "BandName"] == ("Red",)
 
 
+@pytest.mark.parametrize("body", ['<rdf:Description Camera:Yaw="1"/>', '<rdf:Description Camera:BandName="Red"/>'])
+def test_a_value_is_added_in_a_namespace_of_the_packet_or_replaced(body: str) -> None:
+    packet = Packet.parse(enveloped(body))
+    packet.add((NAMESPACE, "Yaw"), "2")
+    assert packet.values()[NAMESPACE, "Yaw"] == ("2",)
+    packet.add(("example.org/other", "Yaw"), "3")
+    assert ("example.org/other", "Yaw") not in packet.values(), "no value used this namespace"
+
+
 def test_the_same_name_in_another_namespace_is_another_tag() -> None:
     tags = Tags(xmp=Packet.parse(enveloped('<rdf:Description other:Yaw="1"/>')).values())
     assert tags.number("example.org/other", "Yaw") == 1
