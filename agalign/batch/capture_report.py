@@ -127,8 +127,7 @@ class FlightReports(list[CaptureReport]):
 
     def _repr_html_(self) -> str:
         max_rows = 20
-        counts = Counter(report.state for report in self)
-        counts.update(report.state for report in self.excluded)
+        counts = Counter(report.state for report in [*self, *self.excluded])
         total = ", ".join(f"{number} {state}" for state, number in counts.items())
         head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
         rows = "".join(
@@ -136,4 +135,4 @@ class FlightReports(list[CaptureReport]):
             for report in self[:max_rows]
         )
         more = f"<p>and {len(self) - max_rows} more</p>" if len(self) > max_rows else ""
-        return f"<p>{counted(len(self), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"
+        return f"<p>{counted(counts.total(), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"

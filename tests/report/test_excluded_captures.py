@@ -138,7 +138,7 @@ def test_panels_are_not_among_the_captures_of_the_api(between_panels: Path, tmp_
     assert [report.state for report in reports.excluded] == ["panel", "panel"]
     copied = pickle.loads(pickle.dumps(reports))
     assert (copied, copied.excluded) == (reports, reports.excluded)
-    assert "2 done, 2 panel" in reports._repr_html_()
+    assert "4 captures: 2 done, 2 panel" in reports._repr_html_()
     with pytest.raises(agalign.InputError, match="IMG_0001: shows a calibration panel; align another capture"):
         agalign.align_capture(agalign.discover(between_panels).captures[0], tmp_path)
 
