@@ -163,6 +163,7 @@ def _indices(
         mask_qa: Omit saturated, occluded and misaligned pixels, also of finished indices; the run needs --qa.
         as_json: Print JSON to standard output.
         overwrite: Compute finished indices again.
+        verbose: Print a line per capture and index.
 
     Examples:
         agalign indices aligned/  NDVI of every capture, next to its stack
