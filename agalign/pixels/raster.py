@@ -43,6 +43,9 @@ Format = Literal["TIFF", "JPEG", "PNG", "JPEG 2000"]
 _FORMATS: dict[str, Format] = {".tif": "TIFF", ".tiff": "TIFF", ".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
 """JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits."""
 _REFUSED: dict[str, Format] = {".jp2": "JPEG 2000", ".j2k": "JPEG 2000"}
+_STARTS = {"GTiff": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "JPEG": (b"\xff\xd8\xff",), "PNG": (b"\x89PNG",)}
+"""First bytes of a file, by the GDAL driver that reads it. Some of GDAL's other drivers execute code or contact
+servers."""
 *_suffixes, _last_suffix = _FORMATS
 IMAGE_KINDS = f"{', '.join(_suffixes)} or {_last_suffix}"
 """The files that are read, in words."""
@@ -107,9 +110,7 @@ def _driver_of(path: Path) -> str:
     except (OSError, ValueError) as error:
         text = getattr(error, "strerror", None) or error
         raise UnreadableFileError(f"{path}: cannot be read ({text})", _COPY_AGAIN) from None
-    # Some of GDAL's other drivers execute code or contact servers.
-    drivers = {"GTiff": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "JPEG": (b"\xff\xd8\xff",), "PNG": (b"\x89PNG",)}
-    for driver, starts in drivers.items():
+    for driver, starts in _STARTS.items():
         if magic.startswith(starts):
             return driver
     if refused := _REFUSED.get(path.suffix.lower()):
