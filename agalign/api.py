@@ -488,7 +488,7 @@ def export(out: str | Path, target: str | Path, program: ExportProgram, *, copy:
     InputError
         `out` is not the output folder of a run, or no capture has the status `ok`.
     ConfigurationError
-        The run wrote no band files.
+        The run wrote no band files, or cloud-optimised ones, which lack the tags of the camera.
     OutputError
         `target` is not empty or cannot be written.
 

@@ -179,7 +179,7 @@ def run(
     for problem in problems:
         terminal.problem(problem)
     totals.is_complete &= not problems
-    if not totals.pairs.captures:  # the report of an earlier run is kept
+    if not totals.pairs.captures:  # the report was not written, and that of an earlier run is kept: read all sidecars
         totals.pairs = pair_totals(out)
     seconds = round(time.monotonic() - started, 1)
     terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)

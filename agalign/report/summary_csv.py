@@ -1,4 +1,6 @@
-"""OUT/summary.csv: a row for each moving band of each capture, and for a reference with something to check."""
+"""OUT/summary.csv: its columns, and the values of a band in them. `report.facts` makes the rows, also of missing bands,
+panels, the sky, and captures without a result.
+"""
 
 import math
 from typing import Any

@@ -48,8 +48,9 @@ def _fits(value: object, hint: Any) -> bool:
     if origin is Literal:
         return isinstance(value, str) and value in arguments
     if origin is Sequence:
-        is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes)
-        return isinstance(value, Sequence) and is_sequence and all(_fits(one, arguments[0]) for one in value)
+        if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+            return False
+        return all(_fits(one, arguments[0]) for one in value)
     if origin is Callable:
         return callable(value)
     if hint is Path:
