@@ -131,9 +131,7 @@ class JointResult:
 
     @property
     def min_retrieval(self) -> float:
-        """The retrieval of held-out patches from which the descriptors distinguish them; above 1 where too few are visible
-        for a test.
-        """
+        """The retrieval of held-out patches from which the descriptors distinguish them; above 1 if few are visible."""
         return max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * self.chance)
 
     @property
