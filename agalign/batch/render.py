@@ -188,6 +188,8 @@ def _bands(context: ProductContext) -> list[BandResult]:
     saturated: dict[str, float] = {}
     with suppress(UnreadableFileError):  # the preview has failed with this reason
         saturated = dict(context.reduced_bands.saturated)
+    for name, clipped in context.clipped.items():
+        saturated[name] = max(saturated.get(name, 0.0), float(clipped.mean()))
     relief = next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None)
     result = []
     for band in context.sidecar.bands:

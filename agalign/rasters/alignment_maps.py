@@ -115,6 +115,10 @@ class QualityRaster(Product):
                 _flags(layer, tile, grid, errors, interpolation, is_predicted=layer.band.name in predicted)
                 for layer in context.layers
             ]
+            window = np.s_[tile.y0 - grid.y0 :, tile.x0 - grid.x0 :]
+            for layer, flags in zip(context.layers, bands, strict=True):
+                if (clipped := context.clipped.get(layer.band.name)) is not None:
+                    flags[clipped[window][: tile.height, : tile.width]] |= Quality.SATURATED.value
             return [np.bitwise_or.reduce(bands), *bands]
 
         tags = {"flag_masks": ", ".join(str(int(flag)) for flag in Quality), "flag_meanings": QUALITY_MEANINGS}

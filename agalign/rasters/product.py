@@ -8,16 +8,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
 from agalign.config import Settings, WriteSettings
 from agalign.host.files import file_checksum
-from agalign.pixels.raster import ReadTile, read_tile
+from agalign.pixels.raster import ReadTile, open_raster, read_tile
 from agalign.rasters.drawing import Grey, ReducedBands, read_reduced_bands
 from agalign.rasters.geotiff import Block, LayerDescription, compressed, write_on_grid
 from agalign.rasters.output_grid import Layer
 from agalign.records.sidecar import PreviewPart, Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
-from agalign.values.image import OutputGrid
+from agalign.values.image import Mask, OutputGrid
 from agalign.values.residual import Residual
 
 
@@ -146,6 +148,21 @@ class ProductContext:
             for index, name in enumerate(file.bands, start=1)
             if name not in gaps
         }
+
+    @cached_property
+    def clipped(self) -> dict[str, Mask]:
+        """By band, True (height, width) where its raw numbers with corrected vignetting have the largest value of their
+        type: the corners of bright images exceed it. Raises UnreadableFileError.
+        """
+        result: dict[str, Mask] = {}
+        for file in (file for file in self.written if file.is_flat):
+            with open_raster(file.path) as source:
+                bands = dict(zip(file.bands, source.read(), strict=True))
+            for name, pixels in bands.items():
+                if pixels.dtype.kind in "ui":
+                    largest = np.iinfo(pixels.dtype).max
+                    result[name] = pixels == (largest - 1 if file.nodata == largest else largest)
+        return result
 
     @cached_property
     def reduced_bands(self) -> ReducedBands:

@@ -323,7 +323,7 @@ class BandResult(_Part):
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
     saturated: Number4 | None = None
-    """Share of saturated pixels in the file, within the crop."""
+    """Share of saturated pixels, within the crop."""
     missing_rows: int = 0
     """Rows at the end of an incomplete file without pixels; they are nodata."""
     share_over_1_px: Number4 | None = None

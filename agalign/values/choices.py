@@ -43,7 +43,8 @@ class Quality(IntFlag):
     NODATA = 2
     """The band's file has no value there."""
     SATURATED = 4
-    """A source pixel under the interpolation kernel is at or above the saturation value."""
+    """A source pixel under the interpolation kernel is at or above the saturation value, or the correction of the
+    vignetting of a raw number exceeded its type."""
     OCCLUDED = 8
     """Nearer parts of the scene occlude it in the band; the value is nodata, or interpolated."""
     PREDICTED = 16

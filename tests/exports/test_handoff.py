@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from agalign.cameras.pix4d import vignetting_on_grid
 from agalign.exports.programs import export
 from agalign.rasters import aligned_files
 from agalign.rasters.output_grid import Layer
+from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.cameras import CameraSpec
-from agalign.values import geometry
+from agalign.values import geometry, remedies
 from agalign.values.capture import Band
+from agalign.values.choices import Quality
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 from agalign.values.radiometry import Radiometry
@@ -67,6 +70,29 @@ def test_vignetting_that_no_polynomial_follows_is_corrected_in_all_bands(
     notes = (tmp_path / "export" / "README.txt").read_text()
     assert "The vignetting of 1 capture is corrected in the pixels of all bands." in notes
     assert {pixels_in(p.path).dtype.name for p in photos} == {"uint16"}
+
+
+@pytest.mark.slow
+def test_pixels_that_corrected_vignetting_makes_too_bright_for_their_type_are_saturated(
+    shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images, strong = capture_by("RedEdge", shared), replace(VIGNETTING, vignetting=(0.0, -9e-6, 0.0))
+    monkeypatch.setattr(aligned_files, "_MAX_VIGNETTING_ERROR", 1e-7)
+    monkeypatch.setattr(aligned_files, "_correction", lambda _: strong)
+    agalign.align_folder(images, tmp_path, settings=seeded(layout="bands", qa=True))
+    (sidecar,) = map(read_sidecar, find_sidecars(tmp_path))
+    folder = find_sidecars(tmp_path)[0].parent
+    with rasterio.open(next(folder.glob("*.qa.tif"))) as dataset:
+        flags = dict(zip(dataset.descriptions, dataset.read(), strict=True))
+    shares = {}
+    for band in sidecar.bands:
+        clipped = pixels_in(folder / band.place.file) == 65535
+        shares[band.band] = clipped.mean()
+        assert band.saturated == pytest.approx(clipped.mean(), abs=1e-4)
+        assert (flags[band.band][clipped] & Quality.SATURATED).all()
+        assert (flags["all bands"][clipped] & Quality.SATURATED).all()
+    assert max(shares.values()) > 0.005
+    assert remedies.SATURATED in {caution.remedy for caution in RunFacts().cautions(sidecar)}
 
 
 def check_reflectance(photos: list[OdmPhoto], expected: list[OdmPhoto]) -> None:
