@@ -50,10 +50,11 @@ def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.flo
         return None
     centre = (np.array(capture.reference.size_px) - 1) / 2
     right, down = ((points_px - centre) / pose.focal_length_px).T
-    # Rays rotated by the pitch, then by the roll: components (forward, right, downward).
+    # Components (forward, right, downward) of rays, rotated by the roll, then by the pitch and the heading, as those of
+    # an aircraft: Rz(yaw) Ry(pitch) Rx(roll).
     pitch, roll, heading = np.radians((pose.pitch_deg, pose.roll_deg, pose.heading_deg))
-    forward, downward = -down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) + down * np.sin(pitch)
-    right, downward = (right * np.cos(roll) - downward * np.sin(roll), downward * np.cos(roll) + right * np.sin(roll))
+    right, below = right * np.cos(roll) - np.sin(roll), np.cos(roll) + right * np.sin(roll)
+    forward, downward = -down * np.cos(pitch) + below * np.sin(pitch), below * np.cos(pitch) + down * np.sin(pitch)
     if not (downward > 0).all():
         return None
     forward_m, right_m = pose.height_m * forward / downward, pose.height_m * right / downward

@@ -71,6 +71,8 @@ def mapped(out: Path, known: Capture, status: str = "ok") -> list[dict[str, Any]
         (Pose(0.0, 10.0, 0.0, 100.0, 1000.0), (319.5, 239.5), (0.0, 17.633)),
         (Pose(0.0, 10.0, 0.0, 100.0, 1000.0), (319.5, 0.0), (0.0, 43.414)),
         (Pose(0.0, 0.0, 10.0, 100.0, 1000.0), (319.5, 239.5), (-17.633, 0.0)),
+        # Yaw, pitch, roll of aircraft: h tan(pitch) forward, h tan(roll) / cos(pitch) to the left.
+        (Pose(0.0, 30.0, 20.0, 100.0, 1000.0), (319.5, 239.5), (-42.028, 57.735)),
         (None, (0.0, 0.0), None),
         (Pose(0.0), (0.0, 0.0), None),
         (Pose(0.0, 60.0, 0.0, 100.0, 1000.0), (0.0, 0.0), None),
