@@ -27,8 +27,8 @@ from agalign.values.mapping_error import MAX_PIXEL_ERROR_PX, ErrorOnGrid
 from agalign.values.parallax import Relief, rounded
 from agalign.values.resampling import is_under_kernel, source_positions, tiles
 
-_SHARE_LATTICE_PX = 64
-"""Distance of the nodes for a share of the image: 300 nodes of a RedEdge determine it to 2 %, in 2 ms."""
+_SHARE_CELL_PX = 16
+"""Side of the cells whose centres a share of the image is counted from: within 0.001 of that of all pixels."""
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
 """Units by layer of the raster of the relief."""
 Flags = NDArray[np.uint16]
@@ -80,7 +80,10 @@ def error_shares(alignment: Alignment, reference: Band, grid: OutputGrid) -> tup
     """
     error = error_map(alignment, reference, grid) if alignment.error is not None and alignment.error.moved else None
     if error is None:
-        error_px = error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX)
+        columns, rows = (-(-n // _SHARE_CELL_PX) for n in (grid.width, grid.height))
+        cell_px = np.divide((grid.width, grid.height), (columns, rows))
+        centres_px = geometry.lattice(columns, rows, columns, rows) * cell_px + (cell_px - 1) / 2
+        error_px = alignment.error_px(grid.reference_positions(centres_px, reference.lens))
         return float((~(error_px <= MAX_PIXEL_ERROR_PX)).mean()), 0.0
     whole = Tile(0, 0, grid.width, grid.height)  # a lattice would miss most of a small area
     return float((error.on_tile(whole) > MAX_PIXEL_ERROR_PX).mean()), float((error.moved_px(whole) > 0).mean())

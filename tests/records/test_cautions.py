@@ -13,7 +13,7 @@ from agalign.cameras.discover import discover
 from agalign.cameras.metadata import exposed_after_s
 from agalign.cli.terminal import Terminal, explain
 from agalign.flight.rig_file import model_fingerprint
-from agalign.rasters.alignment_maps import error_lattice_px, error_shares
+from agalign.rasters.alignment_maps import error_map, error_shares
 from agalign.records.cautions import Caution, RunFacts
 from agalign.records.panels_and_sky import PanelPart
 from agalign.records.sidecar import Sidecar
@@ -22,7 +22,7 @@ from agalign.report.pages import write_pages
 from agalign.report.pair_totals import PairTotals
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, CameraIdentity
-from agalign.values.image import OutputGrid
+from agalign.values.image import OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.remedies import BLURRED, TEXTURELESS
@@ -302,7 +302,8 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
     alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), seed, residual=residual, error=error)
     reference, grid = Band("Green", Path("a.tif"), 1, *size_px, "uint16"), OutputGrid(0, 0, *size_px)
     share, _ = error_shares(alignment, reference, grid)
-    assert share == pytest.approx((error_lattice_px(alignment, reference, grid, 16) > 1).mean(), abs=0.03)
+    of_map = error_map(alignment, reference, grid).on_tile(Tile(0, 0, *size_px)) > 1
+    assert share == pytest.approx(of_map.mean(), abs=0.002)
     assert 0.1 < share < 0.2
 
 
