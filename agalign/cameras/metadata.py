@@ -123,7 +123,7 @@ def tags_of(directories: Mapping[int, Directory]) -> Tags:
         model=_text(first.get("Model")),
         serial=_text(exif.get("BodySerialNumber")) or by_xmp.first_text(_SERIAL_NUMBERS),
         **_position(gps),
-        captured_at=_iso_time(exif, "DateTimeOriginal", "OffsetTimeOriginal")
+        captured_at=_iso_time(exif | {"Make": first.get("Make")}, "DateTimeOriginal", "OffsetTimeOriginal")
         or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
         size_px=_size(first, "ImageWidth", "ImageLength"),
@@ -205,4 +205,6 @@ def _text(value: Any) -> str:
 def _iso_time(exif: Mapping[str, Any], time: str, offset: str) -> str:
     """The time in a tag, with the offset from UTC in another tag if it is plausible; empty without a time."""
     fraction = _text(exif.get("SubsecTimeOriginal") or exif.get("SubsecTime"))
+    if len(fraction) in (7, 8) and _text(exif.get("Make")).lower() == "micasense":
+        fraction = fraction.zfill(9)  # its firmware writes nanoseconds without leading zeros
     return iso_time(_text(exif.get(time)), fraction, _text(exif.get(offset)))

@@ -14,7 +14,7 @@ from PIL.ExifTags import Base
 from agalign.cameras import read_files
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.dji import Dji
-from agalign.cameras.metadata import Tags, finite, read_tags
+from agalign.cameras.metadata import Tags, finite, read_tags, tags_of
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.pix4d import NAMESPACE, perspective_lens, pixels_per_mm
 from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, rational, read_directories, short, text
@@ -230,3 +230,17 @@ def test_a_lens_in_mm_without_exif_has_its_centre_near_the_middle(
     lens = perspective_lens(tags)
     assert (lens and lens.fx_px) == (focal_px and pytest.approx(focal_px, rel=1e-3))
     assert lens is None or lens.is_plausible(size_px)
+
+
+@pytest.mark.parametrize(
+    ("make", "fraction", "expected"),
+    [
+        ("MicaSense", "11205334", ".011205334"),
+        ("MicaSense", "751305499", ".751305499"),
+        ("Other", "1120533", ".1120533"),
+    ],
+)
+def test_micasense_writes_nanoseconds_without_leading_zeros(make: str, fraction: str, expected: str) -> None:
+    """As the counter of the light sensor shows: from 150.249 to 150.994 s the clock goes on to 16:26:19.756."""
+    times = {Base.DateTimeOriginal: text("2021:06:23 16:26:19"), Base.SubsecTime: text(fraction)}
+    assert tags_of({0: {Base.Make: text(make)}, EXIF: times, GPS: {}}).captured_at == f"2021-06-23T16:26:19{expected}"
