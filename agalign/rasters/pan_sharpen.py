@@ -4,8 +4,8 @@
 
 with the bands B resampled to the pixels of the panchromatic band P, as in GDAL's pansharpening. The sum is over the
 bands within the spectral range of P. The weights are the non-negative least-squares fit of these bands to P, blurred to
-their resolution. The transform keeps the ratios between bands; the radiometry of each band changes by P / sum w B,
-which is 1 only on average. Bands outside the range of P are resampled and not sharpened.
+their resolution, times a factor with which the median of P / sum w B is 1. The transform keeps the ratios between these
+bands; the radiometry of each changes by P / sum w B. Bands outside the range of P are resampled and not sharpened.
 """
 
 import math
@@ -120,16 +120,21 @@ def weights_of(bands: FloatImage, pan: FloatImage, scale: float) -> NDArray[np.f
     """Return the weight of each band (bands, height, width) in the panchromatic band, whose pixels are `scale` times
     smaller.
 
-    Non-negative least squares over the pixels that are not nan; equal weights if the fit is impossible.
+    Non-negative least squares over the pixels that are not nan, equal weights if the fit is impossible; times the
+    median ratio, which is not 1 where the panchromatic band is no linear function of the bands, as in a photograph.
     """
     sigma_px = max(0.5 * scale, 0.3)  # the bands may have almost the resolution of the panchromatic band
     blurred = cv2.GaussianBlur(np.nan_to_num(pan), (0, 0), sigma_px)
     known = np.isfinite(pan) & np.isfinite(bands).all(axis=0)
+    weights = np.full(len(bands), 1 / len(bands))
     if known.any():
-        result, _ = nnls(bands[:, known].T.astype(np.float64), blurred[known].astype(np.float64))
-        if result.any():
-            return np.asarray(result)
-    return np.full(len(bands), 1 / len(bands))
+        of_known, pan_of_known = bands[:, known].astype(np.float64), blurred[known].astype(np.float64)
+        result, _ = nnls(of_known.T, pan_of_known)
+        weights = np.asarray(result) if result.any() else weights
+        total = weights @ of_known
+        if (total > 0).any():
+            weights *= float(np.median(pan_of_known[total > 0] / total[total > 0]))
+    return weights
 
 
 def brovey_ratio(bands: FloatImage, pan: FloatImage, weights: NDArray[np.float64]) -> FloatImage:

@@ -50,6 +50,14 @@ def test_weights_are_those_that_the_panchromatic_is_made_with() -> None:
     np.testing.assert_allclose(weights_of(nothing, pan, 2.0), [0.5, 0.5])
 
 
+def test_bands_keep_their_brightness_if_the_photograph_is_not_linear() -> None:
+    """Bands outside its range are not sharpened: the ratios to them would change."""
+    bands, pan = scene()
+    bands, photograph = bands - 1100.0, 255 * ((pan - 990.0) / pan.max()) ** 0.3
+    ratio = brovey_ratio(bands, photograph, weights_of(bands, photograph, 2.0))
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+
+
 def test_the_result_equals_that_of_gdal(tmp_path: Path) -> None:
     bands, pan = scene()
     place = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
