@@ -149,7 +149,7 @@ def _of_image(band: Band, tags: Tags, raw_step: int) -> tuple[Band, PixelScale, 
 
 def _without_lens(band: Band, why: str) -> Band:
     panel = band.panel and replace(band.panel, corners_px=())  # the image is searched for it
-    band = replace(band, lens=None, to_rig=None, other_to_rig=None, panel=panel)
+    band = replace(band, lens=None, to_rig=None, other_to_rig=None, panel=panel, has_other_lens=True)
     if band.radiometry is not None and band.radiometry.is_of_light:  # its vignetting is of the same image
         band = replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({why})")
     return band

@@ -79,7 +79,8 @@ def band_tags(
     """Return the tags for a file with aligned bands from the file, or the page, of `source`.
 
     `vignetting` and `rows` are those of the band; a vignetting of None is corrected in the pixels. With `radiometry`
-    they are also corrected for black level and exposure, and all their tags are left out.
+    they are also corrected for black level and exposure, and all their tags are left out. Lens and calibration of other
+    images than those of the files are left out.
     """
     own, of_reference = _directories(source), _directories(reference)
     black_level: set[int] = set() if radiometry else {Base.BlackLevelRepeatDim, Base.BlackLevel}
@@ -90,7 +91,8 @@ def band_tags(
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     packet.take(reference_packet, _GEOMETRY)
     _put_geometry(packet, reference, tags_of(of_reference), grid)
-    _put_radiometry(packet, source, tags_of(own), vignetting, rows, radiometry=radiometry)
+    without_radiometry = radiometry or source.has_other_lens
+    _put_radiometry(packet, source, tags_of(own), vignetting, rows, radiometry=without_radiometry)
     if serialised := packet.serialised():
         first[XMP] = tiff_directory.byte_string(serialised)
     exif = _on_grid(_without_unset_clock(exif), of_reference[EXIF], reference, grid)
@@ -112,7 +114,7 @@ def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid)
 
     The rig becomes zero: software that reads it would otherwise align the bands a second time.
     """
-    packet.remove(_SENSOR_ONLY)
+    packet.remove(_SENSOR_ONLY + (_GEOMETRY if reference.has_other_lens else ()))
     for name in ("RigRelatives", "RigTranslations"):
         packet.put((pix4d.NAMESPACE, name), ["0", "0", "0"])
     _put_principal_point(packet, reference, tags, grid)
@@ -202,7 +204,8 @@ def _some(directory: Directory, tags: Iterable[int]) -> Directory:
 
 def _on_grid(exif: Directory, of_reference: Directory, reference: Band, grid: OutputGrid) -> Directory:
     """The Exif directory with the focal length and pixel density of the reference, and the size of the output."""
-    result = exif | _some(of_reference, _GEOMETRIC_EXIF)
+    known = {Base.FocalLength} if reference.has_other_lens else _GEOMETRIC_EXIF
+    result = exif | _some(of_reference, known)
     if (of_film := Base.FocalLengthIn35mmFilm) in result:  # relative to the diagonal of the image
         share = math.hypot(grid.width / grid.scale.x, grid.height / grid.scale.y) / math.hypot(*reference.size_px)
         with suppress(TypeError, ValueError, struct.error):  # a damaged tag

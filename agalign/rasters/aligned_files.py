@@ -160,8 +160,10 @@ def _lattice(layer: Layer, grid: OutputGrid) -> tuple[Points, Points]:
 
 def _correction(band: Band) -> Radiometry | None:
     """The correction of a band's vignetting: that of its calibration, which is of the image as it is, also if a program
-    resized it; without a calibration by the tags of the file.
+    resized it; without a calibration by the tags of the file, unless these are of another image.
     """
+    if band.has_other_lens:
+        return None
     known = band.radiometry
     if known is not None and any(known.vignetting) and known.vignetting_divides:
         return replace(known, quantity="relative radiance", full_scale=1.0, gain=1.0, row_gradient=0.0)

@@ -164,6 +164,8 @@ class Band:
     """Tag that is implausible or lacking, which leaves out `radiometry` or its factor to reflectance, in words."""
     panel: Panel | None = None
     """Calibration panel in the image."""
+    has_other_lens: bool = False
+    """True if lens and vignetting in the tags are not those of its image, which a program cropped or reduced."""
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -11,16 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from PIL.ExifTags import Base
 
 from agalign.cameras.consistency import clock_error
 from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
 from agalign.cameras.model_tables import filter_channels, sizes_px
 from agalign.cameras.sun import Sun, sun_position
+from agalign.cameras.tag_transfer import band_tags
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Entry, add_directories, byte_string, read_directories, text
+from agalign.cameras.xmp import Packet
 from agalign.errors import InputError
 from agalign.pixels.radiometry import with_checked_pixels
 from agalign.pixels.raster import read_tile
+from agalign.rasters import aligned_files
 from agalign.values.capture import Capture, CaptureTime, Position
+from agalign.values.image import OutputGrid
 
 from ..conftest import write_band
 from .test_vendors import DJI, MAVIC, VENDORS, Vendor, packet, survey3, write_capture, write_file
@@ -177,6 +182,20 @@ def test_a_part_under_the_tags_of_the_whole_has_no_lens(
     assert f"is not that of an image of {size}, and so in 4 other files" in problem.text
     assert all(b.lens is None and b.to_rig is None and b.radiometry is None for b in only(scan).bands)
     assert "not that of an image" in only(scan).bands[0].missing_calibration
+
+
+def test_tags_of_the_whole_are_not_written_for_a_part(flight: Path, tmp_path: Path) -> None:
+    capture = only(one_capture(flight, tmp_path, pixels=cropped(0.8, (0.5, 0.5)), exif=SIZE_TAGS))
+    band = next(b for b in capture.bands if b is not capture.reference)
+    assert aligned_files._correction(band) is None
+    grid = OutputGrid(0, 0, *capture.reference.size_px)
+    first, exif, _ = band_tags(band, capture.reference, grid, None)
+    names = {name for _, name in Packet.parse(first[XMP].data).values()}
+    assert "BandName" in names
+    of_lens = {"PrincipalPoint", "PerspectiveFocalLength", "PerspectiveDistortion"}
+    assert not names & (of_lens | {"VignettingCenter", "VignettingPolynomial", "RadiometricCalibration"})
+    assert not exif.keys() & {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution, Base.FocalLengthIn35mmFilm}
+    assert Base.FocalLength in exif
 
 
 def test_a_part_of_a_side_is_told_by_the_size_of_the_model(flight: Path, tmp_path: Path) -> None:
