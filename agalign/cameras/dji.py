@@ -63,7 +63,7 @@ class Dji(Camera):
         is_mavic = _is_mavic_3(tags) or bool(re.search(_MAVIC_3_BAND, own_stem(path), re.IGNORECASE))
         centre = pair(tags, "RelativeOpticalCenter")
         by_centres = None if centre is None else geometry.translation(-centre[0], -centre[1])
-        calibrated = _matrix(tags, "CalibratedHMatrix")
+        calibrated = matrix(tags, "CalibratedHMatrix")
         lens = _lens(tags) if is_mavic or calibrated is not None else None
         if len(stored) > 1:
             return colour_bands(stored, lens, None if is_mavic else by_centres)
@@ -74,7 +74,7 @@ class Dji(Camera):
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)
 
     def with_shared_rig(self, bands: Sequence[Band], tags: Sequence[Tags]) -> list[Band]:
-        matrices = (_matrix(t, "DewarpHMatrix") for t in tags if _is_mavic_3(t))
+        matrices = (matrix(t, "DewarpHMatrix") for t in tags if _is_mavic_3(t))
         to_colour = next((m for m in matrices if m is not None), None)
         if to_colour is None:
             return list(bands)
@@ -231,12 +231,12 @@ def pair(tags: Tags, name: str) -> tuple[float, float] | None:
     return None if x is None or y is None else (x, y)
 
 
-def _matrix(tags: Tags, name: str) -> Matrix | None:
-    """A tag as a matrix (3, 3); None if it is missing or singular."""
+def matrix(tags: Tags, name: str) -> Matrix | None:
+    """Return a tag as a matrix (3, 3); None if it is missing or singular."""
     with suppress(GeometryError, ValueError):
-        matrix = np.reshape(tags.numbers(NAMESPACE, name, 9), (3, 3))
-        geometry.invert(matrix)
-        return matrix
+        result = np.reshape(tags.numbers(NAMESPACE, name, 9), (3, 3))
+        geometry.invert(result)
+        return result
     return None
 
 

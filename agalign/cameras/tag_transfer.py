@@ -17,6 +17,7 @@ from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import SAME_ROWS, GridRows, GridVignetting
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Directory
 from agalign.cameras.xmp import Packet, names_in
+from agalign.values import geometry
 from agalign.values.capture import Band, is_clock_set
 from agalign.values.image import OutputGrid
 
@@ -125,6 +126,10 @@ def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid)
     centre = dji.pair(tags, "CalibratedOpticalCenter")
     for axis, value in zip("XY", () if centre is None else grid.px(*centre), strict=False):
         packet.put((dji.NAMESPACE, f"CalibratedOpticalCenter{axis}"), _texts([value]))
+    to_camera = geometry.invert(geometry.translation(-grid.x0, -grid.y0) @ grid.scale.matrix)
+    for name in ("CalibratedHMatrix", "DewarpHMatrix"):  # from px of the file
+        if (matrix := dji.matrix(tags, name)) is not None:
+            packet.put((dji.NAMESPACE, name), _texts((matrix @ to_camera).ravel().tolist()))
     date, terms = dji.dewarp_data(tags)
     if terms:
         scaled = [v * grid.scale.mean for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]

@@ -81,7 +81,9 @@ def test_djis_geometry_is_the_references(tmp_path: Path) -> None:
     assert result.number(DJI, "CalibratedOpticalCenterX") == 2 * 80.5 - 0.5 - 20
     assert result.number(DJI, "CalibratedOpticalCenterY") == 2 * 60.5 - 0.5 - 10
     assert result.text(DJI, "DewarpData") == "2022-09-08;340,340,3,-5,-0.1,0.05,0,0,0"
-    assert result.numbers(DJI, "CalibratedHMatrix")[2] == 1.5
+    # The pixel (80, 60) of the camera, in the plane that the bands share: 1.5 px to the right, 2 px up.
+    at_px = np.reshape(result.numbers(DJI, "CalibratedHMatrix"), (3, 3)) @ [*grid.px(80.0, 60.0), 1.0]
+    assert at_px[:2] / at_px[2] == pytest.approx((81.5, 58.0))
 
 
 @pytest.mark.parametrize(
