@@ -162,6 +162,8 @@ def _vignetting(tags: Tags) -> tuple[tuple[float, float], tuple[float, ...], lis
     other_px, others = pix4d.vignetting(tags)
     if centre_px is None or not any(coefficients):
         return other_px, others, []
+    if others and _is_mavic_3(tags):  # its CalibratedOpticalCenter is that of the design, the middle of the image
+        centre_px = other_px
     contradicted = []
     if others and not _agree(coefficients, others):
         contradicted.append("VignettingData")

@@ -324,6 +324,17 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
     assert not band.radiometry.vignetting_divides
 
 
+def test_the_vignetting_of_a_mavic_3_is_around_its_own_centre(tmp_path: Path) -> None:
+    """Both tags of one real unit: CalibratedOpticalCenter is the middle of the image, by design."""
+    values = {"SensorGain": "2", "ExposureTime": "1000", "BlackLevel": "3200", "VignettingData": "1e-4,0,0,0,0,0"}
+    tags = mavic_tags(**values)
+    of_pix4d = {"VignettingCenter": "1215.959106,946.467468", "VignettingPolynomial": "1e-4,0,0,0,0,0"}
+    both = {(NAMESPACE, name): (value,) for name, value in of_pix4d.items()}
+    band = mavic_band(tmp_path, replace(tags, xmp={**tags.xmp, **both}))
+    assert band.radiometry.vignetting_centre_px == (1215.959106, 946.467468)
+    assert mavic_band(tmp_path, tags).radiometry.vignetting_centre_px == (1296, 972)
+
+
 def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
     for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR"):
         write_file(tmp_path / f"{make}.tif", {271: text(make)}, shape=(5, 120, 160))
