@@ -11,6 +11,7 @@ from agalign.cameras.base import is_thermal
 from agalign.errors import AgalignError
 from agalign.flight.panel_readings import Examine
 from agalign.pixels.gdal import without_warnings
+from agalign.pixels.masks import saturated
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile
 from agalign.values.capture import Band, Capture
@@ -93,11 +94,11 @@ def sky_radiance(band: Band) -> float | None:
         pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     except AgalignError:
         return None
-    if band.saturation_value is not None:
-        valid &= pixels.astype(np.float64) < band.saturation_value
-    if valid.mean() < _MIN_SHARE:
+    is_saturated = saturated(valid, pixels, band.saturation_value)
+    radiance = np.where(is_saturated, np.inf, calibrated(pixels, band.radiometry, 0, 0))[valid]
+    if (valid & ~is_saturated).mean() < _MIN_SHARE:
         return None
-    return float(np.median(calibrated(pixels, band.radiometry, 0, 0)[valid]))
+    return float(np.percentile(radiance, 50, method="lower" if np.isinf(radiance).any() else "linear"))
 
 
 def _has_no_texture(capture: Capture) -> bool:

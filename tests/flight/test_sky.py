@@ -10,8 +10,9 @@ import tifffile
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags
 from agalign.cameras.micasense import MicaSense
-from agalign.flight.sky import sky_captures, sky_cues
+from agalign.flight.sky import sky_captures, sky_cues, sky_radiance
 from agalign.values.capture import Band, Capture
+from agalign.values.radiometry import Radiometry
 
 DLS = "micasense.com/DLS"
 
@@ -75,3 +76,15 @@ def test_no_real_scene_is_classified_as_sky_whatever_its_tags(real_data: Path) -
     assert [s.capture.label for s in sky] == ["water/sky/IMG_0003"]
     turned, _ = sky_captures(replace(c, elevation_deg=60.0) for c in found if "sky" not in c.folder.parts)
     assert turned == []
+
+
+def test_the_median_radiance_counts_saturated_pixels_as_bright(tmp_path: Path) -> None:
+    """Two fifths are saturated, as around the sun: the median is among the brightest of the others."""
+    (band, _) = capture(tmp_path, rough=False, elevation_deg=40.0).bands
+    pixels = np.linspace(10_000, 60_000, 100 * 80).astype(np.uint16).reshape(100, 80)
+    tifffile.imwrite(band.path, np.where(pixels > 40_000, 65_535, pixels).astype(np.uint16))
+    band = replace(band, height_px=100, saturation_value=65535.0)
+    band = replace(band, radiometry=Radiometry("radiance", 0.0, 1.0, 1.0))
+    assert sky_radiance(band) == pytest.approx(35_000, rel=1e-3)
+    tifffile.imwrite(band.path, np.where(pixels > 30_000, 65_535, pixels).astype(np.uint16))
+    assert sky_radiance(band) is None
