@@ -113,14 +113,16 @@ def calibration_of_output(tags: Tags, band: Band, rows: pix4d.GridRows) -> tuple
     a, exposure_s = tags.numbers(*CALIBRATION, 3), finite(tags.exif.get("ExposureTime"))
     if len(a) != 3 or not exposure_s:
         return None
-    at_first_row = 1 + (a[1] / exposure_s - a[2]) * rows.first
+    of_camera, known = a[1] / exposure_s - a[2], band.radiometry
+    # In an image that a program resized, the band's rows are not those of the camera.
+    step = known.row_gradient / of_camera if known is not None and known.row_gradient and of_camera else 1.0
+    at_first_row = 1 + of_camera * step * rows.first
     if not at_first_row > 0:
         return None
     of_type = 2.0 ** (8 * np.dtype(band.dtype).itemsize)
-    known = band.radiometry
     full_scale = known.full_scale if known is not None and known.is_of_light else of_type
     a1, a2, a3 = (k / at_first_row for k in a)
-    return a1 * of_type / full_scale, a2 * rows.step, a3 * rows.step
+    return a1 * of_type / full_scale, a2 * step * rows.step, a3 * step * rows.step
 
 
 def _iso(tags: Tags) -> float | None:

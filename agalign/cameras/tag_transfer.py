@@ -92,7 +92,7 @@ def band_tags(
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     packet.take(reference_packet, _GEOMETRY)
     _put_geometry(packet, reference, tags_of(of_reference), grid)
-    without_radiometry = radiometry or source.has_other_lens
+    without_radiometry = radiometry or (source.has_other_lens and source.radiometry is None)
     _put_radiometry(packet, source, tags_of(own), vignetting, rows, radiometry=without_radiometry)
     if serialised := packet.serialised():
         first[XMP] = tiff_directory.byte_string(serialised)

@@ -162,11 +162,11 @@ def _correction(band: Band) -> Radiometry | None:
     """The correction of a band's vignetting: that of its calibration, which is of the image as it is, also if a program
     resized it; without a calibration by the tags of the file, unless these are of another image.
     """
-    if band.has_other_lens:
-        return None
     known = band.radiometry
     if known is not None and any(known.vignetting) and known.vignetting_divides:
         return replace(known, quantity="relative radiance", full_scale=1.0, gain=1.0, row_gradient=0.0)
+    if band.has_other_lens:
+        return None
     with suppress(UnreadableFileError):
         tags = read_tags(band.path, band.page)
         return vignetting_of(tags, band.size_px, divides=not isinstance(camera_of(tags), Dji))

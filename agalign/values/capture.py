@@ -165,7 +165,7 @@ class Band:
     panel: Panel | None = None
     """Calibration panel in the image."""
     has_other_lens: bool = False
-    """True if lens and vignetting in the tags are not those of its image, which a program cropped or reduced."""
+    """True if lens and vignetting in its file are those of another image, which a program cropped or resized."""
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -15,13 +15,25 @@ from agalign.cameras import read_files
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, finite, read_tags, tags_of
-from agalign.cameras.micasense import MicaSense
-from agalign.cameras.pix4d import NAMESPACE, perspective_lens, pixels_per_mm
-from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, rational, read_directories, short, text
+from agalign.cameras.micasense import CALIBRATION, MicaSense, calibration_of_output
+from agalign.cameras.pix4d import NAMESPACE, SAME_ROWS, GridVignetting, perspective_lens, pixels_per_mm
+from agalign.cameras.tag_transfer import band_tags
+from agalign.cameras.tiff_directory import (
+    EXIF,
+    GPS,
+    XMP,
+    Entry,
+    add_directories,
+    rational,
+    read_directories,
+    short,
+    text,
+)
 from agalign.cameras.xmp import Packet
 from agalign.pixels.radiometry import calibrated
 from agalign.values import geometry
 from agalign.values.capture import Capture, CaptureTime, Panel
+from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
 from .test_vendors import packet
@@ -209,6 +221,20 @@ def test_the_area_of_a_panel_in_tags_follows_the_size_of_the_image(flight: Path)
     assert scale == half
     np.testing.assert_allclose(reduced.panel.corners_px, half.positions(corners))
     assert read_files._without_lens(band, "cropped").panel == Panel("tags", albedo=0.5)
+
+
+def test_tags_of_the_camera_are_not_written_for_an_image_of_another_size(flight: Path, tmp_path: Path) -> None:
+    """agalign uses lens and row gradient scaled; other programs would use the tags as they are."""
+    capture = only(discover(resized(flight, tmp_path / "small", 0.5, with_size=True)))
+    band, grid = capture.bands[3], OutputGrid(0, 0, *capture.reference.size_px)
+    first, exif, _ = band_tags(band, capture.reference, grid, GridVignetting((1, 1), (1e-5,), 0))
+    known = Tags(xmp=Packet.parse(first[XMP].data).values())
+    assert not known.text(NAMESPACE, "PrincipalPoint")
+    assert Base.FocalPlaneXResolution not in exif
+    assert known.numbers(NAMESPACE, "VignettingCenter") == (1, 1)
+    with_gradient = Tags(xmp={CALIBRATION: ("1e-4", "1e-7", "1e-5")}, exif={"ExposureTime": 1e-3})
+    small = replace(band, radiometry=replace(band.radiometry, row_gradient=2 * (1e-7 / 1e-3 - 1e-5)))
+    assert calibration_of_output(with_gradient, small, SAME_ROWS)[1:] == pytest.approx((2e-7, 2e-5))
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
