@@ -18,17 +18,7 @@ from agalign.cameras.metadata import Tags, finite, read_tags, tags_of
 from agalign.cameras.micasense import CALIBRATION, MicaSense, calibration_of_output
 from agalign.cameras.pix4d import NAMESPACE, SAME_ROWS, GridVignetting, perspective_lens, pixels_per_mm
 from agalign.cameras.tag_transfer import band_tags
-from agalign.cameras.tiff_directory import (
-    EXIF,
-    GPS,
-    XMP,
-    Entry,
-    add_directories,
-    rational,
-    read_directories,
-    short,
-    text,
-)
+from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, rational, read_directories, short, text
 from agalign.cameras.xmp import Packet
 from agalign.pixels.radiometry import calibrated
 from agalign.values import geometry
