@@ -27,8 +27,9 @@ from agalign.values.mapping_error import MAX_PIXEL_ERROR_PX, ErrorOnGrid
 from agalign.values.parallax import Relief, rounded
 from agalign.values.resampling import is_under_kernel, source_positions, tiles
 
-_SHARE_CELL_PX = 16
-"""Side of the cells whose centres a share of the image is counted from: within 0.001 of that of all pixels."""
+_SHARE_CELL_PX = 32
+"""Side of the cells whose centres a share of the image is counted from: within 0.002 of that of all pixels for 19 of 20
+bands, in a quarter of the time of cells of 16 px, which are within 0.001."""
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
 """Units by layer of the raster of the relief."""
 Flags = NDArray[np.uint16]
