@@ -253,6 +253,8 @@ class CaptureEstimation:
 
     def _refine_on_files(self, result: Alignments, capture: Capture) -> Alignments:
         """Refine aligned bands on tiles of files that have more pixels than the images; return the alignments then."""
+        if not self._may_be_homography:  # as the refinement is
+            return result
         reduced = [band for name, band in self.bands.items() if is_worth_refining(band.pair, result[name])]
         for band in reduced:
             assert band.accepted is not None  # an aligned band has one

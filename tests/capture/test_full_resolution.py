@@ -11,9 +11,10 @@ import pytest
 import rasterio
 import tifffile
 
+from agalign.batch.capture_task import quiet
 from agalign.cameras.discover import discover
 from agalign.capture import full_resolution
-from agalign.capture.align_bands import align_capture_bands
+from agalign.capture.align_bands import CaptureEstimation, align_capture_bands
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_rig import RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
@@ -30,7 +31,7 @@ from agalign.pixels.raster import open_raster
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
-from agalign.values.choices import Geometry
+from agalign.values.choices import FamilyChoice, Geometry
 from agalign.values.geometry import PairScales
 from agalign.values.image import Tile
 from agalign.values.mapping import DisplacementField, PixelMapping
@@ -106,6 +107,19 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")
     assert geometry.corner_error_px(result["red"].fixed_to_moving, TRUTH, *SIZE) < 0.2
     assert result["red"].residual.centres_px.max() > 700  # px of the file
+
+
+@pytest.mark.parametrize(("family", "is_refined"), [("auto", True), ("translation", False)])
+def test_a_kind_of_mapping_that_the_user_chose_is_not_refined_to_a_homography(
+    capture: Capture, pair: BandPair, family: FamilyChoice, is_refined: bool
+) -> None:
+    settings = Settings(joint=JointSettings(model_family=family, device="cpu"))
+    start = on_reduced_images(pair)
+    bands = {"nir": BandCandidates(pair, SEED, None, [start])}
+    estimation = CaptureEstimation(settings, None, quiet, bands=bands)
+    result = estimation._refine_on_files(estimation.decided(), capture)["nir"]
+    assert result.status == "aligned"
+    assert (result.mapping is not start.mapping) is is_refined
 
 
 def test_each_tile_has_a_chessboard_of_its_windows(capture: Capture) -> None:
