@@ -41,7 +41,8 @@ class FlightModel:
     bands: tuple[str, ...]
     """Names of the moving bands, in the order of the network's sides from 1."""
     mappings: Mapping[str, Matrix]
-    """Median fixed_to_moving of each band that passed held-out retrieval, undistorted px of the files."""
+    """fixed_to_moving of each band that passed held-out retrieval, undistorted px of the files: the mean of the rig if
+    there is one, else the median."""
     fingerprint: str
     """Hash of the captures and settings from which it was learned."""
     rig: Rig | None = None

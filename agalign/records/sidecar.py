@@ -220,7 +220,7 @@ class ErrorPart(_Part):
     """Covariance of the corners (8 x 8), clockwise from the top left, x and y in turn, or with lens shapes (12 x 12);
     null for a prediction by other bands or captures, whose windows are no part of the error."""
     rig_std_px: Number4 = 0.0
-    """Standard error of a prediction by other bands or captures, the same everywhere."""
+    """Part that is the same everywhere: of predictions and second layers."""
     lens_std_px: Annotated[NDArray[np.float64], Array((SHAPES,), 6)] | None = None
     """Standard deviations of the lens shapes that neither tags nor a rig determine."""
     field_std_px: Number4 = 0.0

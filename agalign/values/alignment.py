@@ -60,7 +60,7 @@ class Seed:
     __eq__ = equal
 
     kind: SeedKind
-    """`user`; `match` (SIFT keypoints; with `--seed match` learned descriptors); `model` (median mapping of the
+    """`user`; `match` (SIFT keypoints; with `--seed match` learned descriptors); `model` (mapping of the
     flight); `rig` (camera tags); `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase
     correlation); `identity`."""
     fixed_to_moving: Matrix3x3
@@ -107,7 +107,7 @@ class JointResult:
     iterations: int
     """Training steps."""
     levels: tuple[Number, ...]
-    """Resolutions of the image pyramid; 1 is full."""
+    """Resolutions of the image pyramid by which the mapping was optimised with the network; 1 is full."""
     recipe: str
     """`flight` (frozen network of the flight), `fast` or `scratch` (learned on this capture), `paper`, or `windows`
     (without descriptors)."""

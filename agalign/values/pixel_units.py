@@ -1,9 +1,9 @@
 """The scale between two pixel grids.
 
 A band pair has four pixel grids: those of the *files* of the fixed (reference) and of the moving band, and those of the
-*images* that the estimation uses, which are reductions of large files. The package `capture` measures lengths in px of
-the images, by default of the fixed one; all other packages use px of the files. Names and docstrings state exceptions:
-a moving pixel may cover several times the ground of a fixed one.
+*images* that the estimation uses, which are reductions of large files. The packages `capture`, `method`, `fit` and
+`verify` measure lengths in px of the images, by default of the fixed one; all other packages use px of the files. Names
+and docstrings state exceptions: a moving pixel may cover several times the ground of a fixed one.
 
 Positions count from the CENTRE of the top-left pixel, (0, 0). Two images of the same area share their outer EDGES, so
 a position x of one is (x + 0.5) * scale - 0.5 in the other. Only `PixelScale` implements this formula.
