@@ -128,18 +128,18 @@ class NotEnoughTextureError(AgalignError):
 
 
 class NoContrastError(AgalignError):
-    """No pixel of the reference has enough contrast to learn from.
+    """No valid patch of the reference has enough contrast to learn from.
 
     The public functions do not raise it: they report this reason for the bands, which are not aligned.
 
     Examples
     --------
     >>> print(agalign.NoContrastError())
-    no pixel of the reference band has enough contrast to learn from
+    no valid patch of the reference has enough contrast to learn from
     """
 
     def __str__(self) -> str:
-        return "no pixel of the reference band has enough contrast to learn from"
+        return "no valid patch of the reference has enough contrast to learn from"
 
 
 class SidecarError(InputError):

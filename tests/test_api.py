@@ -94,6 +94,15 @@ def test_unaligned_pairs_have_a_reason(name: str) -> None:
     assert result.reason
 
 
+def test_the_reason_is_not_a_lack_of_contrast_where_invalid_pixels_leave_no_patch() -> None:
+    """The image has contrast, but each patch contains an invalid pixel."""
+    fixed, moving = textured_pair(TRUTH)
+    fixed[np.random.default_rng(0).random(fixed.shape) < 0.1] = np.nan
+    result = agalign.align(fixed, moving)
+    assert result.issues[0].code == "no_contrast"
+    assert (result.reason or "").startswith("no valid patch of the reference has enough contrast")
+
+
 def test_wrong_arguments_are_named() -> None:
     image = textured_image(100, 80)
     good: dict[str, np.ndarray] = {"fixed": image, "moving": image}

@@ -32,7 +32,7 @@ FEW_VALID = IssueKind("few_valid", "only {value:.2%} of the {detail} band is val
 NO_SUCH_SEED = IssueKind("no_such_seed", "this band has no {detail} seed; omit --seed", remedies.ASKED)
 SEED_ASKED_FOR = IssueKind("seed_asked_for", "only the seed was requested", remedies.ASKED)
 NO_CONTRAST = IssueKind(
-    "no_contrast", "no pixel of the reference band has enough contrast to learn from", remedies.TEXTURELESS
+    "no_contrast", "no valid patch of the reference has enough contrast to learn from", remedies.TEXTURELESS
 )
 FEW_KEYPOINTS = IssueKind(
     "few_keypoints", "only {value:.0f} keypoints are in the area that both bands show", remedies.TEXTURELESS
