@@ -67,9 +67,10 @@ def align(
     Parameters
     ----------
     fixed
-        Reference image, (H, W), (H, W, C) or (C, H, W), of any numeric type, also a PyTorch tensor. NaN, masked pixels
-        (`numpy.ma`) and constant areas at the border are ignored, and so is the largest value of 8 and 16 bit integers,
-        which counts as saturated.
+        Reference image, (H, W), (H, W, C) or (C, H, W), of any numeric type, also a PyTorch tensor. NaN and masked
+        pixels (`numpy.ma`) are ignored, and so are areas at the border with the value 0 or the largest one of an
+        integer type. The largest value of 8 and 16 bit integers counts as saturated: areas of it at least 7 px wide
+        are ignored everywhere. Use `fixed_valid` for other fill values.
     moving
         The other image, likewise. Its size may differ from that of `fixed`.
     seed
