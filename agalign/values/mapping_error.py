@@ -20,7 +20,7 @@ from agalign.values.image import FloatImage, Tile
 from agalign.values.lens_shapes import CORNERS, SHAPES, lens_shapes, variance_of_shapes_px2, variance_px2
 from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
-from agalign.values.pixel_units import Size
+from agalign.values.pixel_units import SAME_PIXELS, Size
 from agalign.values.resampling import between_nodes, nodes_along
 from agalign.values.residual import Residual, noise_px, square_weights
 
@@ -148,16 +148,21 @@ class MappingError:
     def in_file_px(self, scales: PairScales, size_px: Size, parallax: Parallax | None) -> "MappingError":
         """Convert the error between images to one between their files; `size_px` is that of the reference's file, and
         `parallax` that between the files.
+
+        What the windows say about unknown lenses is part of the covariance of a reduced image: its least error of a
+        shift, px, is not that of the file.
         """
         up = scales.fixed.inverse
         per_axis = np.r_[np.tile(up, 4), np.full(SHAPES, up.mean)]
+        covariance_px2 = self.covariance_px2 if scales.fixed == SAME_PIXELS else self._with_lenses
+        is_given = covariance_px2 is self.covariance_px2
         return replace(
             self,
             size_px=size_px,
-            covariance_px2=_scaled(self.covariance_px2, per_axis),
+            covariance_px2=_scaled(covariance_px2, per_axis),
             residual=None if self.residual is None else self.residual.in_file_px(scales),
             rig_std_px=self.rig_std_px * up.mean,
-            lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
+            lens_std_px=self.lens_std_px * up.mean if is_given and self.lens_std_px is not None else None,
             field_std_px=self.field_std_px * up.mean,
             relief_std_px=self.relief_std_px * up.mean,
             parallax=parallax,

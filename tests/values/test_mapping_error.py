@@ -215,6 +215,15 @@ def test_the_error_between_images_is_that_between_files(sigma: float) -> None:
     np.testing.assert_allclose(between_files.error_px(2 * points + 0.5), expected, rtol=0.01)
 
 
+def test_the_error_of_an_accurate_mapping_with_unknown_lenses_is_the_same_between_files() -> None:
+    """The least error of a shift, which limits what the windows say about the lenses, is in px of the images."""
+    windows = residual_of(columns(4).centres_px, (0.01, 0.0))
+    error = MappingError(SIZE, np.zeros((8, 8)), windows, lens_std_px=lens_std_px(SIZE, calibrated=False))
+    points = np.random.default_rng(2).uniform(1, (638, 478), (200, 2))
+    between_files = error.in_file_px(PairScales(HALF, HALF), (1280, 960), None)
+    np.testing.assert_allclose(between_files.error_px(2 * points + 0.5), 2 * error.error_px(points), rtol=0.02)
+
+
 def test_windows_with_much_noise_say_little_of_the_error() -> None:
     """Their noise is known only to a factor, here to 1.4. They overlap, as under a relief."""
     rng = np.random.default_rng(0)
