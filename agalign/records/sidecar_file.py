@@ -158,10 +158,16 @@ def label_of(sidecar: Path, out: Path) -> str:
 
 def run_sidecars(out: Path) -> list[Path]:
     """Return the sidecars below the output folder of a run. Raises InputError if there are none, or if the folder
-    contains output folders of runs and is none itself.
+    contains the output folders of runs or is inside of one, and is none itself.
     """
-    if not (out / RUN_FILE).is_file() and (inner := next(out.rglob(RUN_FILE), None)) is not None:
-        raise InputError(f"{out}: contains runs, such as {inner.parent}, and is none itself; give the folder of one")
+    if not (out / RUN_FILE).is_file():
+        # The lock, the tables and the report of a run are for all folders in it.
+        if whole := next((parent for parent in out.resolve().parents if (parent / RUN_FILE).is_file()), None):
+            raise InputError(f"{out}: is a part of the run in {whole}; give that folder")
+        if inner := next(out.rglob(RUN_FILE), None):
+            raise InputError(
+                f"{out}: contains runs, such as {inner.parent}, and is none itself; give the folder of one"
+            )
     sidecars = find_sidecars(out) if out.is_dir() else []
     if not sidecars and (out / RUN_FILE).is_file():
         raise InputError(f"{out}: the run there has no results: it was stopped, or all captures failed; run it again")

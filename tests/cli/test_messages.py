@@ -31,7 +31,7 @@ from agalign.host.files import PANELS_FILE, write_model
 from agalign.records.cautions import RunFacts
 from agalign.records.panels_and_sky import PanelPart, PanelsFile
 from agalign.records.run_record import Finished, RunPart, begun
-from agalign.records.sidecar_file import write_sidecar
+from agalign.records.sidecar_file import run_sidecars, write_sidecar
 from agalign.report.pages import pair_totals
 from agalign.report.pair_totals import PairTotals
 
@@ -141,6 +141,22 @@ def test_a_folder_of_runs_is_not_a_run(tmp_path: Path, command: str) -> None:
     assert done.returncode == 1
     assert f"{tmp_path}: contains runs, such as {tmp_path / 'one'}, and is none itself; give the folder" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["one"]
+
+
+@pytest.mark.parametrize("command", ["report {}", "indices {}", "verify {}", "export {} --for odm"])
+def test_a_folder_in_a_run_is_not_a_run(tmp_path: Path, command: str) -> None:
+    """The run may be locked, and its tables and report have the captures of all its folders."""
+    part, inner = tmp_path / "run" / "set", tmp_path / "run" / "inner"
+    for folder, of_run in ((part, tmp_path / "run"), (inner, inner)):
+        make_aligned(folder, 1)
+        (of_run / "agalign-run.json").touch()
+    files = sorted(tmp_path.rglob("*"))
+    done = agalign_here(*(part if argument == "{}" else argument for argument in command.split()))
+    assert done.returncode == 1
+    assert f"{part}: is a part of the run in {tmp_path / 'run'}; give that folder" in done.stderr
+    assert sorted(tmp_path.rglob("*")) == files
+    # A run in the folder of another is a run of its own.
+    assert run_sidecars(inner)
 
 
 NOT_LOCAL = (
