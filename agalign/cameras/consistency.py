@@ -293,11 +293,14 @@ def _doubtful(bands: Sequence[Band]) -> Iterator[tuple[str, Path]]:
             yield f"the bands {one.name} and {other.name} of a capture have one wavelength, {nm:g} nm", other.path
 
 
-def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> Iterator[Problem]:
+def of_other_captures(groups: Sequence[Sequence[ImageFile]]) -> Iterator[Problem]:
     """Yield a problem for each file with the tags of a different capture: its position is far from that of the other
-    files of its capture, or only its serial number differs. `groups` are the files of each capture.
+    files of its capture, or these share a serial number, and its own is in no other capture. `groups` are the files of
+    each capture.
     """
     advice = "correct the tags"
+    # The second half of a dual camera, or the camera of one band, has its own serial number in every capture.
+    captures = Counter(serial for group in groups for serial in {f.tags.serial for f in group})
     for group in (g for g in groups if len(g) > 2):
         places = [(f, f.tags.position) for f in group if f.tags.position is not None]
         if places:
@@ -309,7 +312,8 @@ def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> Iterator[Problem
                     text = f"its position is {km:.0f} km from that of the other files of its capture; {advice}"
                     yield problem_of(file.path, text, is_harmless=True)
         serials = Counter(f.tags.serial for f in group if f.tags.serial)
-        for file in (f for f in group if serials[f.tags.serial] == 1 < len(serials)):
+        is_shared = len(serials) == 2 < serials.total()
+        for file in (f for f in group if is_shared and serials[f.tags.serial] == 1 == captures[f.tags.serial]):
             text = f"its serial number {file.tags.serial} is not that of the other files; {advice}"
             yield problem_of(file.path, text, is_harmless=True)
 

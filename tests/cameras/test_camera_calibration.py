@@ -23,7 +23,7 @@ from agalign.rasters.aligned_files import _correction
 from agalign.values.capture import Band, Capture, CaptureTime
 
 from ..conftest import write_band
-from .test_vendors import DJI, NAMESPACE, packet
+from .test_vendors import DJI, NAMESPACE, packet, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 FLIGHT_FOLDER = Path("0000SET", "000")
@@ -398,6 +398,20 @@ def test_files_of_one_capture_share_position_and_serial_number(images: Path) -> 
     texts = [p.text for p in discover(images).problems]
     assert [t for t in texts if "IMG_0001_4.tif: its position is 111 km from that of the other files" in t]
     assert [t for t in texts if "IMG_0001_3.tif: its serial number OTHER is not that of the other files" in t]
+
+
+@pytest.mark.parametrize(
+    "serials",
+    [("0A1 0B2 0C3",), ("0A1 0B2 -",), ("0A1 0B2 0C3",) * 2, ("A A A A A B", "A A A A A B B B B B")],
+    ids=["one capture", "one without", "two captures", "dual"],
+)
+def test_bands_of_several_cameras_have_several_serial_numbers(tmp_path: Path, serials: tuple[str, ...]) -> None:
+    """Of a rig with a camera for each band; of a dual camera, with files of the second half lost."""
+    for number, of_capture in enumerate(serials):
+        for k, serial in enumerate(of_capture.split()):
+            exif = {} if serial == "-" else {0xA431: text(serial)}
+            write_file(tmp_path / f"f{number}_{400 + 50 * k}nm.tif", {272: text("Rig")}, exif)
+    assert not [p.text for p in discover(tmp_path).problems if "serial number" in p.text]
 
 
 @pytest.mark.parametrize(
