@@ -124,8 +124,8 @@ class DiscoverOptions:
     """Folders to skip, such as the output folder."""
     max_pixels: Annotated[int, Field(ge=1)] = choices.MAX_PIXELS
     """Refuse images with more pixels, without reading them."""
-    jobs: int = 1
-    """Number of processes that read tags; with more than one, the calling script must be importable."""
+    jobs: Annotated[int, Field(ge=0, le=choices.MAX_JOBS)] = 1
+    """Number of processes that read tags, 0 for one per core; with more, the calling script must be importable."""
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6)] = None
     """Seconds after which reading the tags of a file is abandoned; by default unlimited. Needs a separate process."""
     include: Annotated[tuple[str, ...], _GLOBS] = ()

@@ -19,6 +19,7 @@ from agalign.errors import InputError, UnreadableFileError
 from agalign.host.files import is_inside
 from agalign.host.own_files import has_mark
 from agalign.host.process_pool import WorkerDiedError, open_pool
+from agalign.host.processes import cores_for
 from agalign.host.text import shortened
 from agalign.pixels.radiometry import plausible
 from agalign.pixels.raster import probe, read_tile, suffix_format, value_step
@@ -36,8 +37,9 @@ _MIN_FILES_FOR_PROCESSES = 1000
 
 def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
     """Yield each file with its bands, or the reason why it cannot be used, in the order of `paths`."""
-    if options.timeout_s is not None or (options.jobs > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES):
-        yield from _read_in_processes(paths, options)
+    cores = cores_for(options.jobs)
+    if options.timeout_s is not None or (cores > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES):
+        yield from _read_in_processes(paths, options, cores)
     else:
         yield from _read_task(paths, options)
 
@@ -182,11 +184,10 @@ def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
     return [page for page in pages if page[0].size_px == largest_px]
 
 
-def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
+def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions, cores: int) -> Iterator[ImageFile | Problem]:
     tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
-    processes = min(options.jobs, len(tasks))
     # The workers import this module when they start: tasks do not wait for that.
-    with open_pool(processes, 1, partial(import_module, __name__)) as pool:
+    with open_pool(min(cores, len(tasks)), 1, partial(import_module, __name__)) as pool:
         submit = partial(pool.submit, _read_task, timeout_s=options.timeout_s)
         futures = [submit(task, options) for task in tasks]
         for task, future in zip(tasks, futures, strict=True):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from pydantic import ValidationError
 
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.generic import Generic
@@ -360,6 +361,18 @@ def test_several_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pyte
     one, several = (discover(tmp_path, DiscoverOptions(jobs=jobs)) for jobs in (1, 2))
     assert one.captures == several.captures
     assert [p.text for p in one.problems] == [p.text for p in several.problems]
+
+
+@pytest.mark.parametrize("jobs", [-3, 10**9])
+def test_numbers_of_processes_have_the_range_of_other_options(jobs: int) -> None:
+    with pytest.raises(ValidationError, match=r"jobs"):
+        DiscoverOptions(jobs=jobs)
+
+
+@pytest.mark.slow
+def test_no_number_of_processes_is_one_per_core(tmp_path: Path) -> None:
+    write_fields(tmp_path, 1)
+    assert len(discover(tmp_path, DiscoverOptions(jobs=0, timeout_s=60)).captures) == 1
 
 
 @pytest.mark.full
