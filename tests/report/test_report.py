@@ -26,7 +26,7 @@ from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.report import facts as facts_module
 from agalign.report.charts import CHART_HEIGHT, drifts_of, hues_of, rig_views
-from agalign.report.facts import CameraOffsets
+from agalign.report.facts import CameraOffsets, FlightFacts
 from agalign.report.pages import SCRIPTS, pages_exist, write_pages
 from agalign.report.pair_totals import PairTotals
 from agalign.report.terms import DOC_PAGES, TERMS
@@ -82,6 +82,14 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
             measured, centres = (list(chain(*windows[name])) for name in ("shifts_px", "centres_px"))
             assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for v in measured]
             assert details["lattices"][pair["lattice"]] == centres
+
+
+def test_the_median_share_of_masked_pixels_is_that_of_the_console(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = FlightFacts.write
+    monkeypatch.setattr(FlightFacts, "write", lambda self: self.masked.update(ndvi=[0.3, 0.01]) or write(self))
+    write_pages(out, pytest.fail)
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert "mask pixels of 2 captures, median 15.5 %, at most 30.0 %" in page
 
 
 def headline(out: Path, on_problem: Callable[[str], object] = pytest.fail) -> str:
