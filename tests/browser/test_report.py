@@ -426,6 +426,15 @@ def test_the_table_sorts_and_filters(page: Any) -> None:
     assert "0000SET/000/IMG_0001" not in labels()
 
 
+def test_the_address_of_an_unknown_capture_shows_what_failed(browser: Any, out: Path) -> None:
+    """It may be that of another report, or of a capture that was renamed."""
+    page = opened(browser, out, "gone")
+    page.wait_for_function(
+        "() => document.querySelector('#capture-title')?.textContent.includes('IMG_0002')", timeout=5000
+    )
+    page.close()
+
+
 def test_a_season_is_loaded_in_parts(browser: Any, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(facts, "_DETAILS_PER_PART", 2)
     monkeypatch.setattr(facts, "_ROWS_PER_PART", 5)
@@ -448,6 +457,9 @@ def test_a_season_is_loaded_in_parts(browser: Any, out: Path, tmp_path: Path, mo
     cut = browser.new_page()
     cut.goto((tmp_path / "index.html").as_uri() + "#capture=IMG%2")
     cut.wait_for_function("() => document.querySelector('#count').textContent === '12 of 12 shown'", timeout=5000)
+    cut.wait_for_function(
+        "() => document.querySelector('#capture-title')?.textContent.includes('IMG_0000')", timeout=5000
+    )
     cut.close()
     shutil.rmtree(tmp_path / "report-data")
     page.reload()

@@ -82,9 +82,13 @@ function openByHash() {
   });
 }
 
-/** Show the capture of the address, else one with a failed band. */
-function openByHashOrWorst() {
-  if (labelInHash() !== null) openByHash();
+/**
+ * Show the capture of the address, else one with a failed band; while rows are still loaded, the address may be that of
+ * one of them. @param {boolean} isLoaded
+ */
+function openByHashOrWorst(isLoaded) {
+  const label = labelInHash();
+  if (label !== null && (!isLoaded || captures.some((row) => row.label === label))) openByHash();
   else if (captures.length) openCapture(captures.find((row) => row.status === "failed") ?? captures.find(isUnaligned) ?? captures[0]);
 }
 

@@ -79,7 +79,7 @@ function loadRows(number = 0) {
   if (file === undefined) {
     showRows();
     drawMap();
-    if (opened.capture === null) openByHashOrWorst();
+    if (opened.capture === null) openByHashOrWorst(true);
     return;
   }
   byId("count").textContent = `${captures.length} of ${facts.captures} loaded`;

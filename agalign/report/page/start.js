@@ -15,5 +15,5 @@ byId("only").addEventListener("change", showRows);
 window.matchMedia("print").addEventListener("change", (event) => showForPrint(event.matches));
 window.addEventListener("hashchange", openByHash);
 listenToStage();
-openByHashOrWorst();
+openByHashOrWorst(facts.row_files.length === 0);
 if (facts.row_files.length) loadRows();
