@@ -131,7 +131,10 @@ def _parts(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any, 
         case ast.BinOp(left, ast.Div(), right):
             one, divisor = _parts(left, values), _divisor(right, values)
             return one[0] / divisor, one[1] / np.abs(divisor), one[2]
-        case ast.BinOp(base, ast.Pow(), right) if _is_number(right) and (power := _value(right, values)) >= 0:
+        case ast.BinOp(base, ast.Pow(), right) if _is_number(right):
+            if (power := _value(right, values)) < 0:
+                inverse = np.float32(1) / _divisor(base, values, -power)
+                return inverse, np.abs(inverse), np.bool_(True)
             value, magnitude, is_certain = _parts(base, values)
             return value**power, magnitude**power, is_certain
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
