@@ -411,7 +411,7 @@ def test_another_scene_is_found_also_in_an_inaccurate_result() -> None:
 
 def test_a_second_layer_is_at_least_the_error_of_a_prediction() -> None:
     """Of rows of vines, 0.25 of the image, that are 4 px off."""
-    facts = {"common_px": geometry.lattice(*SIZE, 12, 9), "second_layer": Layer((4.0, 0.0), 0.25)}
+    facts = {"common_px": geometry.lattice(*SIZE, 12, 9), "second_layer": Layer((4.0, 0.0), 0.25, 0.07)}
     seen = SimpleNamespace(issues=(Issue(SECOND_LAYER, 0.25, 0.07, "4 px"),), **facts)
     for std_px in (0.1, 5.0):
         own = candidate(std_px=std_px, images=seen)
