@@ -141,9 +141,8 @@ def _of_image(band: Band, tags: Tags, raw_step: int) -> tuple[Band, PixelScale, 
         to_rig, other = (None if h is None else geometry.rescale(h, scale, SAME_PIXELS) for h in planes)
         radiometry = band.radiometry and replace(band.radiometry.rescaled(scale), raw_step=1)
         panel = band.panel and band.panel.rescaled(scale)
-        lens = rescaled(band.lens, scale)
-        band = replace(band, lens=lens, to_rig=to_rig, other_to_rig=other, radiometry=radiometry, panel=panel)
-        band = replace(band, has_other_lens=True)
+        band = replace(band, lens=rescaled(band.lens, scale), has_other_lens=True)
+        band = replace(band, to_rig=to_rig, other_to_rig=other, radiometry=radiometry, panel=panel)
     if not why and band.lens is not None and not band.lens.is_plausible(band.size_px):
         why = consistency.lens_of_other_image(band)
     return _without_lens(band, why) if why else band, scale, why

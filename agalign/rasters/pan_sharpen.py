@@ -121,7 +121,7 @@ def weights_of(bands: FloatImage, pan: FloatImage, scale: float) -> NDArray[np.f
     smaller.
 
     Non-negative least squares over the pixels that are not nan, equal weights if the fit is impossible; times the
-    median ratio, which is not 1 where the panchromatic band is no linear function of the bands, as in a photograph.
+    median ratio, which differs from 1 for a photograph, whose values are not proportional to radiance.
     """
     sigma_px = max(0.5 * scale, 0.3)  # the bands may have almost the resolution of the panchromatic band
     blurred = cv2.GaussianBlur(np.nan_to_num(pan), (0, 0), sigma_px)

@@ -235,9 +235,7 @@ def test_a_model_is_learned_again_if_its_input_changed(flight: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 50, 500])
-def test_only_captures_to_learn_from_are_learned_from(
-    flight: Path, count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_captures_to_learn_from_are_learned_from(flight: Path, count: int) -> None:
     """Whatever is unusable of them: the model depends on no other images."""
     (one, *_) = agalign.discover(flight).captures
     captures = [replace(one, name=f"{number}") for number in range(count)]
