@@ -202,7 +202,7 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Un
     if not _is_relief_accepted(estimate.bands, result):
         return {}
     result |= estimate.of_other_bands(others)
-    if any(band.pair.has_rig for band in group):
+    if any(band.pair.is_lens_known for band in group):
         return result
     return {name: _with_field_on_relief(candidate) for name, candidate in result.items()}
 
@@ -223,7 +223,7 @@ class _Estimate:
         Raises GeometryError.
         """
         planes, size_px = [_Band(b, b.warped.mapping) for b in group], group[0].pair.fixed.size_px
-        lens_std = None if any(b.pair.has_rig for b in group) else group[0].pair.lens_std_px
+        lens_std = None if any(b.pair.is_lens_known for b in group) else group[0].pair.unknown_lens_std_px
         consistent = consistent_bands(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
@@ -289,7 +289,7 @@ class _Estimate:
         fit_residual = partial(_fit_residual, band)
         if len(fit_residual(start).measured_px) < MIN_WINDOWS:
             return None
-        size_px, lens_std = band.pair.fixed.size_px, None if band.pair.has_rig else band.pair.lens_std_px
+        size_px, lens_std = band.pair.fixed.size_px, band.pair.unknown_lens_std_px
         fitted = fit_in_rounds(start, fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None

@@ -211,8 +211,8 @@ class RefinedBand:
         joint, verified = band.joint, band.verified
         plane = Candidate.of(verified, joint)
         # Without a rig a field is fitted whatever the costly checks of the pixels find, which check its result too.
-        issues = plane.issues if self.pair.has_rig else plane.issues_of_windows
-        is_wanted = use == "always" or (use == "auto" and (not self.pair.has_rig or bool(issues)))
+        issues = plane.issues if self.pair.is_lens_known else plane.issues_of_windows
+        is_wanted = use == "always" or (use == "auto" and (not self.pair.is_lens_known or bool(issues)))
         if is_wanted and all(issue.kind in BY_PARALLAX for issue in issues):
             yield from _with_field(plane, verified, joint, is_aligned_input=use == "auto" and band is not self)
         else:
