@@ -19,7 +19,9 @@ from agalign.flight.rig import (
     capture_factors,
     design_tensor,
 )
+from agalign.flight.rig_prediction import contradicts, predict_band
 from agalign.values.least_squares import least_squares
+from agalign.verify.checks import MAX_UNEXPECTED_PX
 
 Array = NDArray[np.float64]
 LensLayout = Mapping[str, tuple[float, float]]
@@ -51,8 +53,61 @@ def learn_rig(
 ) -> Rig | None:
     """Estimate the rig from captures; None if no band has a mapping in at least MIN_CAPTURES of them.
 
-    `size_px` is (width, height) of the reference. `apply` runs the cross-validations.
+    `size_px` is (width, height) of the reference. `apply` runs the cross-validations. A few mappings that contradict
+    the rig of all others, such as aliases in repetitive scenes, are left out.
     """
+    of_all = learned = _learned(captures, size_px, layout, apply)
+    # A wrong mapping may hide another one: all that are far away are left out first, then each is compared.
+    max_wrong_share = 1 / 8  # of the mappings; the model does not describe a flight with more
+    kept, left_out, max_wrong = list(captures), [], max_wrong_share * sum(len(c.mappings) for c in captures)
+    while learned is not None and (farthest := _farthest(learned, kept)) is not None:
+        left_out.append(farthest)
+        if len(left_out) > max_wrong:
+            return of_all
+        kept = _without(kept, [farthest])
+        learned = _learned(kept, size_px, layout, apply)
+    wrong = [] if learned is None else [(k, b) for k, b in left_out if _is_wrong(learned, b, captures[k], kept[k])]
+    if len(wrong) == len(left_out):
+        return learned
+    return _learned(_without(captures, wrong), size_px, layout, apply) if wrong else of_all
+
+
+def _farthest(learned: Rig, captures: Sequence[Observation]) -> tuple[int, str] | None:
+    """Return number of the capture and band of the mapping that is farthest from its prediction by at least two other
+    bands; None if all are close.
+    """
+    # Half of a contradiction, as a mapping moves the mean of few captures. In flights without wrong mappings, the
+    # maximum was 0.3 px.
+    max_close_px, min_others = MAX_UNEXPECTED_PX / 2, 2  # fewer do not show which mapping is wrong
+    distances_px = {
+        (number, band): rig.distance_px(mapping, predict_band(learned, band, capture).fixed_to_moving, learned.size_px)
+        for number, capture in enumerate(captures)
+        if len(capture.mappings.keys() & learned.mean.keys()) > min_others
+        for band, mapping in capture.mappings.items()
+        if band in learned.mean
+    }
+    farthest = max(distances_px, key=distances_px.__getitem__, default=None)
+    return None if farthest is None or distances_px[farthest] <= max_close_px else farthest
+
+
+def _is_wrong(learned: Rig, band: str, capture: Observation, others: Observation) -> bool:
+    """Return True if a band of a capture contradicts its `others`; not if these contradict each other."""
+    alone = replace(others, mappings={**others.mappings, band: capture.mappings[band]})
+    return band in learned.mean and contradicts(learned, band, alone)
+
+
+def _without(captures: Sequence[Observation], wrong: Sequence[tuple[int, str]]) -> list[Observation]:
+    """Return the captures without some mappings, each given by the number of its capture and its band."""
+    return [
+        replace(capture, mappings={b: m for b, m in capture.mappings.items() if (number, b) not in wrong})
+        for number, capture in enumerate(captures)
+    ]
+
+
+def _learned(
+    captures: Sequence[Observation], size_px: tuple[int, int], layout: LensLayout, apply: EachFactors
+) -> Rig | None:
+    """Estimate the rig from all mappings."""
     counts = Counter(b for c in captures for b in c.mappings)
     bands = tuple(b for b, count in counts.items() if count >= MIN_CAPTURES)
     captures = [c for c in captures if any(b in c.mappings for b in bands)]

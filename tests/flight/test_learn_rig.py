@@ -69,6 +69,31 @@ def test_tilt_is_selected_where_the_ground_tilts() -> None:
     assert error_px(rig, "Red", known, mappings(0.5, (3.0, -2.0))["Red"])[0] < 0.3
 
 
+def shifted(capture: Observation, shifts_px: dict[str, tuple[float, float]]) -> Observation:
+    """The same with displaced mappings."""
+    moved = {b: geometry.compose(geometry.translation(*xy), capture.mappings[b]) for b, xy in shifts_px.items()}
+    return replace(capture, mappings={**capture.mappings, **moved})
+
+
+@pytest.mark.parametrize("wrong_px", [8.0, 60.0])
+def test_wrong_mappings_are_not_learned_from_and_contradict_the_rig(wrong_px: float) -> None:
+    """Two of one band hide each other: the rig of the others contains one of them."""
+    right, wrong = flight(6), {1: "Red", 3: "Red", 4: "NIR"}
+    captures = [shifted(c, {wrong[k]: (wrong_px, 0.0)} if k in wrong else {}) for k, c in enumerate(right)]
+    rig = learn_rig(captures, SIZE, {})
+    assert {(k, b) for k, c in enumerate(captures) for b in BASELINES if contradicts(rig, b, c)} == set(wrong.items())
+    assert max(rig.from_bands_px.values()) < 0.5  # 2 px or more with one of them
+
+
+def test_captures_that_the_model_does_not_describe_are_learned_from() -> None:
+    """No majority of their bands shows which mapping is wrong; a rig without them would contradict them all."""
+    moved = shifted(flight(6)[2], {"Red": (12.0, 0.0), "NIR": (0.0, 12.0), "Blue": (-8.0, 4.0)})
+    others = [c for k, c in enumerate(flight(6)) if k != 2]
+    rig = learn_rig([*others, moved], SIZE, {})
+    assert not any(contradicts(rig, b, moved) for b in BASELINES)
+    assert rig.from_bands_px["Red"] > 2
+
+
 def test_without_common_variation_no_factor_is_selected() -> None:
     still = [observation(float(k), 0.0, noise=0.05, seed=k) for k in range(8)]
     rig = learn_rig(still, SIZE, {})
