@@ -23,6 +23,7 @@ from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.metrics import with_metrics
 from agalign.capture.reference import Reference
+from agalign.capture.seeding import with_reduced_reference
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.exports.programs import ExportReport
@@ -75,7 +76,8 @@ def align(
         The other image, likewise. Its size may differ from that of `fixed`.
     seed
         Initial alignment: homography (3, 3) from pixels of `fixed` to pixels of `moving`, accurate to about 10 % of the
-        image size. By default it is estimated from the images.
+        image size. By default it is estimated from the images. `fixed` is reduced for a `moving` with much larger
+        pixels, as of a thermal camera.
     seed_std_px
         Standard error of `seed`, px of `fixed`. It selects one of several matches in a repetitive scene, which is
         otherwise not aligned.
@@ -125,8 +127,9 @@ def align(
         matrices = {"user": homography_of(seed, "seed")}
     seed_std: dict[SeedKind, float] = {} if seed_std_px is None else {"user": float(seed_std_px)}
     pair = BandPair("moving", Reference(fixed_raster), moving_raster, matrices, seed_std_px=seed_std)
-    result = align_pairs([pair], settings, quiet)
-    return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
+    pair = with_reduced_reference(pair, settings.seed)
+    between_arrays = align_pairs([pair], settings, quiet)["moving"].in_file_px(pair.scales, fixed_raster.size_px)
+    return replace(with_metrics(between_arrays, pair), moving_size_px=moving_raster.size_px)
 
 
 @checked

@@ -55,6 +55,28 @@ def test_two_arrays_without_any_hint(monkeypatch: pytest.MonkeyPatch) -> None:
         result.warp(moving)
 
 
+@pytest.mark.parametrize("is_seeded", [True, False])
+def test_the_fixed_image_is_reduced_for_much_larger_pixels(is_seeded: bool) -> None:
+    """As in folders: its noise and detail are not in the other. Results are in px of the whole arrays."""
+    coarse_px, shift = (80, 60), geometry.translation(9.0, -7.0)
+    fixed, moving = textured_pair(shift, 640, 480)
+    coarse = cv2.resize(moving, coarse_px, interpolation=cv2.INTER_AREA)
+    coarse += 0.5 * coarse.std() * np.random.default_rng(0).normal(size=coarse.shape).astype(np.float32)
+    overlay = geometry.overlay((640, 480), coarse_px)
+    result = agalign.align(fixed, coarse, **({"seed": overlay, "seed_std_px": 15.0} if is_seeded else {}))
+    assert (result.status, result.size_px, result.moving_size_px) == ("aligned", (640, 480), coarse_px)
+    assert mean_error_px(result.fixed_to_moving, geometry.compose(overlay, shift), 640, 480) < 0.1
+    assert result.std_band_px == pytest.approx(result.std_px / 8, rel=0.01)
+
+
+def test_a_small_image_that_shows_a_part_is_not_one_of_larger_pixels() -> None:
+    """The reference is not reduced for it: the error is that of its pixels."""
+    fixed, moving = textured_pair(geometry.translation(-150.0, -90.0), 640, 480)
+    result = agalign.align(fixed, moving[:180, :240])
+    assert result.status == "aligned"
+    assert result.std_px < 0.1
+
+
 def test_channels_are_first_or_last() -> None:
     rgb = np.dstack([as_uint8(textured_image(80, 60, seed)) for seed in range(3)])
     channels_last, channels_first = raster_of(rgb, None, "rgb"), raster_of(np.moveaxis(rgb, -1, 0), None, "rgb")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras.tag_seeds import tag_seeds
-from agalign.capture.reference import LONGEST_SIDE_PX, Reference, longest_for
+from agalign.capture.reference import LONGEST_SIDE_PX, Reference, is_coarse, longest_for
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.fit.windows import FixedWindows
@@ -214,13 +214,13 @@ def read_pairs(
                 unusable[band.name] = Issue(UNREADABLE, detail=str(error))
         if not by_name:
             continue
-        longest = longest_for(capture.reference, next(iter(matrices.values())))
+        longest = longest_for(capture.reference.size_px, next(iter(matrices.values())))
         if longest not in references:
             references[longest] = Reference(read_for_alignment(capture.reference, longest, read))
         usable = {name: image for name, image in by_name.items() if textured(image)} or by_name
         unusable |= {n: blank_issue(image, BLANK_MOVING) for n, image in by_name.items() if n not in usable}
         moving = _mean(_mostly_valid(list(usable.values())))
-        pair = _pair(capture.reference, references[longest], longest, bands, moving, matrices, model)
+        pair = _pair(capture.reference, references[longest], bands, moving, matrices, model)
         pairs.append(replace(pair, bands=tuple(b for b in bands if b.name in usable)))
     return _without_stripes(pairs, references[LONGEST_SIDE_PX]), unusable
 
@@ -240,21 +240,20 @@ def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[Ba
 def _pair(
     band: Band,
     reference: Reference,
-    longest: int,
     bands: Sequence[Band],
     moving: Raster,
     matrices: SeedMatrices,
     model: FlightModel | None,
 ) -> BandPair:
-    """Create the pair of `reference`, the image of `band` reduced to `longest` px, and the image of `bands`."""
+    """Create the pair of `reference`, the image of `band`, perhaps reduced, and the image of `bands`."""
     name = bands[0].name
-    is_coarse = longest < min(LONGEST_SIDE_PX, max(band.size_px))
     scales = PairScales.of((band.size_px, bands[0].size_px), (reference.image.size_px, moving.size_px))
     reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
     tags_std_px = 5.0  # their errors in flights have medians of 2 to 9 px and a maximum of 12 px (benchmarks/seeds.py)
     std_px: dict[SeedKind, float] = dict.fromkeys(_TAGS, tags_std_px * scales.fixed.mean)
     layout = relative_parallax(band, bands[0])
-    pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, layout=layout)
+    coarse = is_coarse(band.size_px, next(iter(matrices.values())))
+    pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, coarse, layout=layout)
     return pair if model is None or model.rig is None or not pair.has_rig_pixels else _with_rig(pair, model.rig)
 
 

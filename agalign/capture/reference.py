@@ -15,7 +15,6 @@ from agalign.pixels.band_resampling import channel_mean, shrink, textured
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
@@ -137,15 +136,20 @@ class Reference:
         return FixedSimilarity(self.grey)
 
 
-def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
-    """Return the longer side, px, to which the reference is reduced for a moving band.
+def longest_for(size_px: tuple[int, int], fixed_to_moving: Matrix) -> int:
+    """Return the longer side, px, to which a reference (width, height) is reduced for a moving band.
 
     It is less than LONGEST_SIDE_PX for a band with much larger pixels, as of a thermal camera.
     """
-    ratio = geometry.magnification(fixed_to_moving, *reference.size_px)
+    ratio = geometry.magnification(fixed_to_moving, *size_px)
     if not 0 < ratio < COARSE_RATIO:
         return LONGEST_SIDE_PX
     oversampling = 2.0  # along a line; more pixels of the reference add no common detail
     min_side_px = 128  # required by the windows
-    side_px = round(oversampling * ratio * max(reference.size_px))
+    side_px = round(oversampling * ratio * max(size_px))
     return min(LONGEST_SIDE_PX, max(side_px, min_side_px))
+
+
+def is_coarse(size_px: tuple[int, int], fixed_to_moving: Matrix) -> bool:
+    """Return True if a reference (width, height) is reduced for a moving band, which has much larger pixels."""
+    return longest_for(size_px, fixed_to_moving) < min(LONGEST_SIDE_PX, max(size_px))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, SeedMatrices, blank_issue
+from agalign.capture.reference import Reference, is_coarse, longest_for
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.fit.window_fit import fit_in_rounds
@@ -13,13 +14,13 @@ from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.learned_matches import match_seed, matching_network, starter_for_matching
 from agalign.method.state import ImageGroup, MovingImage
-from agalign.pixels.band_resampling import channel_mean, textured, warped
+from agalign.pixels.band_resampling import channel_mean, shrink, textured, warped
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
 from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Seed
 from agalign.values.choices import SeedKind, Space
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, PairScales
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.verify.checks import seed_fits
 
@@ -278,3 +279,25 @@ def _peak(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> Peak | Non
     # Peaks farther from the user's candidate than its standard error allows are aliases.
     max_shift_px = max(_SAME_PEAK_PX, pair.max_shift_px * max(scale)) if kind == "user" else np.inf
     return find_peak(surface, exclusion_px=max(size) // 16, max_shift_px=max_shift_px)
+
+
+def with_reduced_reference(pair: BandPair, settings: SeedSettings) -> BandPair:
+    """Return a pair of arrays with one initial mapping, with the reference reduced for a moving image with much larger
+    pixels, as of a thermal camera.
+
+    Without a seed of the user, a small image may also show a part of the other: the seed that is found decides.
+    """
+    ((kind, start),) = pair.seed_matrices.items()
+    size_px = pair.fixed.size_px
+    if not is_coarse(size_px, start):
+        return pair
+    found = Seed("user", start, 0.0) if kind == "user" else find_seed(pair, settings, None)
+    if isinstance(found, Issue) or not is_coarse(size_px, found.fixed_to_moving):
+        return pair
+    width, height = (max(1, round(side * longest_for(size_px, start) / max(size_px))) for side in size_px)
+    image = shrink(pair.fixed, (width, height))
+    scales = PairScales.of(pair.sizes_px, (image.size_px, pair.moving_image.size_px))
+    matrices: SeedMatrices = {kind: scales.between_images(start)}
+    std_px = {kind: px * scales.fixed.mean for kind, px in pair.seed_std_px.items()}
+    reduced = replace(pair, reference=Reference(image), seed_matrices=matrices, scales=scales, seed_std_px=std_px)
+    return replace(reduced, is_coarse=True)

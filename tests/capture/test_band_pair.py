@@ -117,7 +117,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
 def test_the_reference_is_worth_refining_for_a_coarse_band(ratio: float, longest: int) -> None:
     band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")
     mapping = np.diag([abs(ratio), ratio, 1.0])
-    assert longest_for(band, mapping) == longest
+    assert longest_for(band.size_px, mapping) == longest
 
 
 @pytest.mark.full
