@@ -29,7 +29,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
 
     Options:
         out: Output folder of an earlier run.
-        as_json: Print the content of the report as JSON.
+        as_json: Print the content of the report as JSON; keys may change.
     """
     from agalign.host.output_folder import locked
     from agalign.records.sidecar_file import run_sidecars
