@@ -17,7 +17,15 @@ from agalign.batch.earlier_results import EarlierResults, Remaining
 from agalign.batch.flight_learning import captures_to_learn_from, learn_flight
 from agalign.batch.model_files import ModelFiles
 from agalign.batch.selection import Selection, select_captures
-from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
+from agalign.batch.workers import (
+    MAX_THREADS,
+    DaskExecutor,
+    RunTasks,
+    failure_text,
+    numbers_of_workers,
+    open_workers,
+    serially,
+)
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
@@ -84,12 +92,14 @@ def run_flight(
     in OUT/agalign-run.json.
     Raises OutputError if the output folder cannot be used, another run writes there, the disk is full or outputs were
     removed, WorkerError if no worker process can be started or worker processes end one after another, InputError or
-    ConfigurationError for `model`, ConfigurationError for a device, for results of other captures of the same name, and
-    for a radiometry or georeference that no capture has the tags for.
+    ConfigurationError for `model`, ConfigurationError for a device, for a Dask worker that does not see the folders,
+    for results of other captures of the same name, and for a radiometry or georeference that no capture has tags for.
     """
     run = _FlightRun(flight, out, settings, options or RunOptions(), listener or Listener()).checked(model)
     with locked(out):
         # What can be refused is refused before the record and the pages of an earlier run are touched.
+        if isinstance(run.options.executor, DaskExecutor):
+            run.options.executor.refuse_missing([*(c.reference.path for c in flight.captures[:1]), out])
         yield from _run_selected(run, run.selected())
 
 

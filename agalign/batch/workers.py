@@ -18,6 +18,7 @@ from concurrent.futures import (
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from agalign._version import __version__
@@ -325,6 +326,17 @@ class DaskExecutor(Executor):
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
         return self._executor.submit(_on_worker, __version__, function, *arguments, **named)
 
+    def refuse_missing(self, paths: Sequence[Path]) -> None:
+        """Raise ConfigurationError if a worker does not see one of some paths, WorkerError without a scheduler."""
+        try:
+            missing = self._client.run(_missing, [path.absolute() for path in paths], on_error="return")
+        except Exception as error:  # Dask's, of many classes
+            raise WorkerError(self.loss or f"the Dask workers do not answer ({error})") from None
+        for worker, path in sorted(missing.items()):
+            if isinstance(path, Path):  # not the error of a worker that ended
+                text = f"the Dask worker at {worker} does not see it; mount the same folders there under the same paths"
+                raise ConfigurationError(f"{path}: {text}")
+
     @property
     def loss(self) -> str:
         """Why no task can complete any more; empty while the scheduler answers."""
@@ -334,6 +346,10 @@ class DaskExecutor(Executor):
             "the Dask scheduler does not answer any more; finished captures are kept, and the same command resumes "
             "the run"
         )
+
+
+def _missing(paths: Sequence[Path]) -> Path | None:
+    return next((path for path in paths if not path.exists()), None)
 
 
 def _on_worker(version: str, function: Callable[..., R], *arguments: Any, timeout_s: float | None = None) -> R:

@@ -1,5 +1,6 @@
 """Captures in worker processes, of agalign and of a Dask cluster, and after the end of a worker."""
 
+import re
 import signal
 import socket
 import subprocess
@@ -193,6 +194,18 @@ def test_a_dask_worker_without_this_version_is_refused(answer: object, problem: 
     assert workers._on_worker(agalign.__version__, abs, -2, timeout_s=30) == 2
     with pytest.raises(ConfigurationError, match=r"^a Dask worker has agalign .*; install agalign 0\.0\.9 there$"):
         workers._on_worker("0.0.9", abs, -2)
+
+
+def test_a_dask_worker_without_the_folders_ends_the_run_before_it_begins(flight: Path, tmp_path: Path) -> None:
+    """Each capture would be reported as a file that does not exist, which the user sees here."""
+    image = discover(flight).captures[0].reference.path
+    executor = DaskExecutor(client({"tcp://a:1": None, "tcp://b:1": image, "tcp://c:1": OSError("ended")}))
+    problem = f"^{re.escape(str(image))}: the Dask worker at tcp://b:1 does not see it; mount the same folders"
+    with pytest.raises(ConfigurationError, match=problem):
+        list(run_flight(discover(flight), tmp_path / "out", Settings(), RunOptions(executor=executor)))
+    assert list((tmp_path / "out").iterdir()) == []
+    assert workers._missing([flight, tmp_path / "out"]) is None
+    assert workers._missing([flight, tmp_path / "elsewhere"]) == tmp_path / "elsewhere"
 
 
 def test_a_dask_scheduler_without_workers_is_reported(caplog: pytest.LogCaptureFixture) -> None:
