@@ -41,11 +41,6 @@ noise are wrong at edges, those of water and fog are not."""
 
 _MAX_REFLECTANCE_ERROR = 1.0
 """Of a usable reflectance: a factor of 2 changes every index."""
-_WITHOUT_REFLECTANCE = Remedy(
-    "radiance, not reflectance: the tags of the light sensor cannot be used",
-    "compare the tags with those of the other captures, and correct them; --radiometry panel uses calibration panels, "
-    "--radiometry camera writes radiance of all captures",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +130,7 @@ class RunFacts:
             yield from _of_factors(band_part)
             if output.without_reflectance and band_part.quantity != "temperature":
                 reason = f"not written as reflectance: {output.without_reflectance}"
-                yield Caution(band_part.band, _WITHOUT_REFLECTANCE, reason, 1.0, is_unusable=True)
+                yield Caution(band_part.band, remedies.WITHOUT_REFLECTANCE, reason, 1.0, is_unusable=True)
         scales = self._sensor_scales(sidecar)
         age_s = output.panel_age_s or 0.0
         choice = sidecar.write_options.get("radiometry", "auto")

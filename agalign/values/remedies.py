@@ -97,6 +97,11 @@ _PANEL_ADVICE = {
 }
 CONTRADICTING_LIGHT = {choice: Remedy(_CONTRADICTING_LIGHT, advice) for choice, advice in _PANEL_ADVICE.items()}
 """By the `--radiometry` of the run."""
+WITHOUT_REFLECTANCE = Remedy(
+    "radiance, not reflectance: the tags of the light sensor cannot be used",
+    "compare the tags with those of the other captures, and correct them; --radiometry panel uses calibration panels, "
+    "--radiometry camera writes radiance of all captures",
+)
 UNCORRECTED = Remedy(
     "radiance and reflectance lack a correction: the tags do not have its factor",
     "update the firmware of the camera, or give files with all its tags; a calibration panel corrects what is the same "
