@@ -110,7 +110,9 @@ class FlightFacts:
             if status == "missing":
                 self._summary.add(keys | {"band": name, "status": status, "reason": reason, "check": reason})
         self._count(facts, sidecar.camera.unit)
-        self._map.add(label, sidecar, [row.path.relative_to(self.out).as_posix() for row in indices if row.path])
+        rasters = [row.path.relative_to(self.out).as_posix() for row in indices if row.path]
+        medians = {f"{index['name']}_median": index["median"] for index in facts["indices"]}
+        self._map.add(label, sidecar, rasters, expected_error_px=facts["error_px"], **medians)
         self._rows.add(_map_row(facts))
         self._details.add(facts)
 

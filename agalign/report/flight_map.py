@@ -26,8 +26,9 @@ class FlightMap:
     def __init__(self) -> None:
         self._features: dict[str, dict[str, Any]] = {}
 
-    def add(self, label: str, sidecar: Sidecar, indices: Sequence[str] = ()) -> None:
-        """Add a capture, given its label and the rasters of its indices, relative to the output folder.
+    def add(self, label: str, sidecar: Sidecar, indices: Sequence[str] = (), **values: float | None) -> None:
+        """Add a capture, given its label and the rasters of its indices, relative to the output folder, and further
+        values.
 
         The geometry is the footprint of the aligned rasters, or of the reference if there are none. Without a footprint
         it is the position of the camera, and null if that is unknown.
@@ -46,6 +47,7 @@ class FlightMap:
                 # Of the worst aligned band, px of the reference.
                 "residual_px": rounded(sidecar.largest_residual("residual_px")),
                 "residual_p95_px": rounded(sidecar.largest_residual("residual_p95_px")),
+                **values,
                 # Files are relative to the output folder.
                 "sidecar": f"{label}.json",
                 "stack": files.get("stack"),

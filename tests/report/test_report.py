@@ -705,4 +705,8 @@ def test_a_run_from_python_that_is_stopped_writes_its_pages(flight: Path, tmp_pa
 def test_indices_from_python_are_in_the_report(out: Path) -> None:
     agalign.indices(out)
     assert [i["name"] for i in facts_of(out)["details"]["records"][0]["indices"]] == ["ndvi"]
-    assert "IMG_0001_ndvi.tif" in (out / "flight.geojson").read_text()
+    properties = read_json(out / "flight.geojson")["features"][0]["properties"]
+    assert properties["indices"] == ["0000SET/000/IMG_0001_ndvi.tif"]
+    record = facts_of(out)["details"]["records"][0]
+    assert properties["ndvi_median"] == record["indices"][0]["median"]
+    assert properties["expected_error_px"] == max(b["error_px"] for b in record["bands"] if b["error_px"])

@@ -131,20 +131,3 @@ function colourByValue(valueIn, scale, colour, text) {
 function blueToRed(share) {
   return `hsl(${Math.round(200 - 200 * clamp(share, 0, 1))} 70% 45%)`;
 }
-
-/** Save what the map shows, as a file for a GIS. */
-function saveMap() {
-  const features = captures.filter((row) => row.position !== null).map((row) => ({
-    type: "Feature",
-    geometry: { type: "Point", coordinates: [row.position?.[1], row.position?.[0], ...(row.altitude_m === null ? [] : [row.altitude_m])] },
-    properties: {
-      capture: row.label, captured_at: row.captured_at, camera: row.camera, status: row.status, stack: row.stack,
-      residual_px: row.residual_px, expected_error_px: row.error_px,
-      ...Object.fromEntries(Object.entries(row.indices).map(([name, value]) => [`${name}_median`, value])),
-    },
-  }));
-  const text = JSON.stringify({ type: "FeatureCollection", features });
-  const link = el("a", { href: URL.createObjectURL(new Blob([text], { type: "application/geo+json" })), download: "captures.geojson" });
-  link.click();
-  window.setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-}

@@ -9,7 +9,6 @@ showTableHead();
 showRows();
 drawMap();
 document.getElementById("map-colour")?.addEventListener("change", colourMap);
-document.getElementById("map-save")?.addEventListener("click", saveMap);
 byId("find").addEventListener("input", showRows);
 byId("only").addEventListener("change", showRows);
 window.matchMedia("print").addEventListener("change", (event) => showForPrint(event.matches));
