@@ -69,6 +69,8 @@ class Method:
     """Return the outcome for two images and the initial homography, px."""
     uses_start: bool = True
     """False if the outcome does not depend on the initial homography."""
+    has_homography: bool = True
+    """False for a method of descriptors alone."""
 
 
 RECIPES = "fast", "scratch", "paper"
@@ -164,7 +166,7 @@ def _saved_network(path: Path) -> Method:
         state = JointState(JointSettings(device="cpu"), lambda *_: None)
         return _by_network(net, state, fixed, moving), None
 
-    return Method(apply, uses_start=False)
+    return Method(apply, uses_start=False, has_homography=False)
 
 
 # ---- other methods
@@ -173,7 +175,7 @@ def _saved_network(path: Path) -> Method:
 def _from_patches(
     side: int,
     describe_patches: Callable[[Tensor], Tensor],
-    homography: Callable[[Raster, Raster], Matrix | None] = lambda *_: None,
+    homography: Callable[[Raster, Raster], Matrix | None] | None = None,
 ) -> Method:
     """Return the method of a descriptor of patches (N, 1, side, side) in [0, 1], with the homography of two images."""
 
@@ -183,9 +185,9 @@ def _from_patches(
             mapped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
             return describe_patches(grey_patches(fixed, grid)), describe_patches(grey_patches(moving, mapped))
 
-        return describe, homography(fixed, moving)
+        return describe, None if homography is None else homography(fixed, moving)
 
-    return Method(apply, uses_start=False)
+    return Method(apply, uses_start=False, has_homography=homography is not None)
 
 
 def homography_by_sift(fixed: Raster, moving: Raster) -> Matrix | None:
@@ -248,7 +250,7 @@ def _elastix(fixed: Raster, moving: Raster, start: Matrix) -> Outcome:
     """Register the pair by elastix with the number of pyramid levels of recipe paper."""
     warped_moving = warped(channel_mean(moving), PixelMapping(start), fixed.size_px)
     result = elastix_affinity(channel_mean(fixed), warped_moving, len(pyramid(max(fixed.size_px))))
-    return None, start if result is None else geometry.compose(start, result)
+    return None, None if result is None else geometry.compose(start, result)
 
 
 def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
@@ -333,7 +335,7 @@ class Result:
     average_precision: float = math.nan
     """nan for a method without descriptors."""
     error_px: float = math.nan
-    """Mean over the keypoints; nan for a method without a homography."""
+    """Mean over the keypoints; inf without a result, nan for a method without a homography."""
     error_share: float = math.nan
     """`error_px` divided by the longer side of the second image."""
     seconds: float = math.nan
@@ -384,8 +386,8 @@ def evaluate(
                 precision = error_px = math.nan
                 if describe is not None and len(keypoints):
                     precision = average_precision(*describe(keypoints, truth))
-                if result is not None and len(keypoints):
-                    error_px = homography_error_px(result, truth, points_px)
+                if method.has_homography and len(keypoints):
+                    error_px = math.inf if result is None else homography_error_px(result, truth, points_px)
                 share = error_px / max(moving.size_px)
                 yield replace(empty, average_precision=precision, error_px=error_px, error_share=share, seconds=seconds)
 
