@@ -220,6 +220,16 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
     assert boxes.correlation(aligned["NIR"].mapping) < -0.9
 
 
+@pytest.mark.parametrize(("is_lens_known", "unknowns"), [(False, 12), (True, 8)])
+def test_lens_shapes_are_fitted_unless_the_rig_contains_them(
+    is_lens_known: bool, unknowns: int, candidates: Sequence[RefinedBand]
+) -> None:
+    """A rig may contain the bands without their lenses, where windows miss a part of the image in all captures."""
+    of_rig = [with_pair(band, seed_std_px={"model": 1.0}, is_lens_known=is_lens_known) for band in candidates]
+    aligned, _ = aligned_by_relief(of_rig, "auto")
+    assert {a.error.covariance_px2.shape for a in aligned.values()} == {(unknowns, unknowns)}
+
+
 def test_reliefs_from_different_bands_give_a_standard_error(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
     one, other = (Relief(np.full((40, 60), z, np.float32), np.ones((40, 60), np.float32)) for z in (1.0, 3.0))
     of_four = np.sqrt(3 * 0.75)

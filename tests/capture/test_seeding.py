@@ -8,7 +8,7 @@ import pytest
 from agalign.cameras.tag_seeds import geo_seed
 from agalign.capture import seeding
 from agalign.capture.band_pair import BandPair, SeedMatrices
-from agalign.capture.seeding import best_seed, corrected, find_rotated, find_seed
+from agalign.capture.seeding import best_seed, corrected, find_rotated, find_seed, with_reduced_reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
@@ -230,3 +230,13 @@ def test_an_inaccurate_match_is_corrected_by_windows(monkeypatch: pytest.MonkeyP
     seed = find_seed(pair_of(fixed, image), SeedSettings())
     assert mean_error_px(off, truth, 400, 320) > 1.0
     assert mean_error_px(seed.fixed_to_moving, truth, 400, 320) < 0.5
+
+
+def test_a_reference_is_reduced_with_the_seed_and_its_standard_error() -> None:
+    start = geometry.compose(geometry.overlay((640, 480), (80, 60)), geometry.translation(9.0, -7.0))
+    pair = pair_of(texture(640, 480), texture(80, 60), {"user": start}, user=16.0)
+    reduced = with_reduced_reference(pair, SeedSettings())
+    assert (reduced.fixed.size_px, reduced.is_coarse, reduced.seed_std_px) == ((160, 120), True, {"user": 4.0})
+    np.testing.assert_allclose(reduced.scales.between_files(reduced.seed_matrices["user"]), start, atol=1e-9)
+    same_pixels = pair_of(texture(640, 480), texture(80, 60), {"user": np.eye(3)})
+    assert with_reduced_reference(same_pixels, SeedSettings()) is same_pixels
