@@ -115,9 +115,7 @@ def test_without_one_lens_neither_is_corrected(flight: Path) -> None:
     ("ratio", "longest"), [(1.0, 2700), (2.0, 2700), (0.5, 2700), (0.25, 640), (0.0775, 198), (0.01, 128), (0.0, 2700)]
 )
 def test_the_reference_is_worth_refining_for_a_coarse_band(ratio: float, longest: int) -> None:
-    band = Band("Green", Path("x.tif"), 1, 1280, 960, "uint16")
-    mapping = np.diag([abs(ratio), ratio, 1.0])
-    assert longest_for(band.size_px, mapping) == longest
+    assert longest_for((1280, 960), np.diag([abs(ratio), ratio, 1.0])) == longest
 
 
 @pytest.mark.full
