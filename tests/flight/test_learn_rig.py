@@ -75,11 +75,10 @@ def shifted(capture: Observation, shifts_px: dict[str, tuple[float, float]]) -> 
     return replace(capture, mappings={**capture.mappings, **moved})
 
 
-@pytest.mark.parametrize("wrong_px", [8.0, 60.0])
-def test_wrong_mappings_are_not_learned_from_and_contradict_the_rig(wrong_px: float) -> None:
+def test_wrong_mappings_are_not_learned_from_and_contradict_the_rig() -> None:
     """Two of one band hide each other: the rig of the others contains one of them."""
     right, wrong = flight(6), {1: "Red", 3: "Red", 4: "NIR"}
-    captures = [shifted(c, {wrong[k]: (wrong_px, 0.0)} if k in wrong else {}) for k, c in enumerate(right)]
+    captures = [shifted(c, {wrong[k]: (8.0, 0.0)} if k in wrong else {}) for k, c in enumerate(right)]
     rig = learn_rig(captures, SIZE, {})
     assert {(k, b) for k, c in enumerate(captures) for b in BASELINES if contradicts(rig, b, c)} == set(wrong.items())
     assert max(rig.from_bands_px.values()) < 0.5  # 2 px or more with one of them
