@@ -213,7 +213,7 @@ class _FlightLearner:
         if unaligned:
             net = initial_network(self._bands, self.settings, self.start)
             trained = self._trained(net, unaligned)
-            if sum(len(one.residuals) for one in trained) > sum(len(one.residuals) for one in unaligned):
+            if sum(len(one.aligned) for one in trained) > sum(len(one.aligned) for one in unaligned):
                 return net, [*(one for one in usable.values() if one.is_aligned), *trained]
         return initial_network(self._bands, self.settings, self.start), list(usable.values())
 
@@ -248,7 +248,7 @@ class _FlightLearner:
             for one in self._from_each(task, some):
                 if one is not None:
                     earlier = result.get(one.capture.label, one)
-                    result[one.capture.label] = max(earlier, one, key=lambda o: len(o.residuals))
+                    result[one.capture.label] = max(earlier, one, key=lambda o: len(o.aligned))
                 self.progress("the rig", min(1.0, len(result) / count))
         return [result[c.label] for c in self.captures if c.label in result]
 
@@ -272,7 +272,7 @@ class _FlightLearner:
 
 def _known(rig: Rig, observations: Iterable[LearningCapture]) -> list[tuple[str, Observation]]:
     """Return the aligned bands of the rig, each with all mappings of its capture."""
-    return [(band, one.observation) for one in observations for band in one.residuals if band in rig.mean]
+    return [(band, one.observation) for one in observations for band in one.aligned if band in rig.mean]
 
 
 def _contradict(rig: Rig, observations: Iterable[LearningCapture]) -> bool:
@@ -282,7 +282,7 @@ def _contradict(rig: Rig, observations: Iterable[LearningCapture]) -> bool:
 
 def _min_observations(observations: Iterable[LearningCapture]) -> int:
     """Return the number of observations of the aligned band with the fewest."""
-    counts = Counter(band for o in observations for band in o.residuals)
+    counts = Counter(band for o in observations for band in o.aligned)
     return min(counts.values(), default=0)
 
 

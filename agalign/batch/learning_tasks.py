@@ -11,7 +11,7 @@ import numpy as np
 from agalign.batch.capture_task import quiet
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_rig import observed
+from agalign.capture.by_rig import is_inaccurate, observed
 from agalign.capture.candidate import BandCandidates
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import Settings
@@ -72,10 +72,13 @@ class LearningCapture:
     capture: Capture
     refined: Mapping[str, RefinedPair]
     """Mappings of all bands before they were combined."""
-    residuals: Mapping[str, Residual]
-    """Of the aligned bands."""
+    aligned: frozenset[str]
+    """The aligned bands."""
     observation: Observation
-    """The mappings of the aligned bands, for the rig."""
+    """The mappings of the aligned bands for the rig, and inaccurate ones: the captures of a flight together are more
+    accurate than each of them."""
+    residuals: Mapping[str, Residual]
+    """Shifts of windows under these mappings, px of the files."""
     is_aligned: bool
     """True if all bands that could be read are aligned."""
 
@@ -84,14 +87,19 @@ class LearningCapture:
         """Collect the results for the pairs of a capture."""
         result, pairs = estimation.decided(), estimation.pairs
         in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
-        residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-        observation = observed(pairs, result, capture)
+        residuals = {
+            name: a.residual
+            for name, a in in_file_px.items()
+            if a.residual is not None and (a.status == "aligned" or is_inaccurate(a))
+        }
+        aligned = frozenset(name for name in residuals if result[name].status == "aligned")
+        observation = observed(pairs, result, capture, with_inaccurate=True)
         refined = {
             name: RefinedPair(band.found, joint, band.pair.scales.between_files(joint.fixed_to_moving))
             for name, band in estimation.bands.items()
             if isinstance(band.found, Seed) and band.refined and (joint := band.refined.joint) and band.issue is None
         }
-        return cls(capture, refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
+        return cls(capture, refined, aligned, observation, residuals, is_aligned=len(aligned) == len(pairs))
 
     @property
     def mappings(self) -> dict[str, Matrix]:

@@ -14,9 +14,10 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px, expected_square, lattice
 from agalign.flight.rig_prediction import predict_band
-from agalign.values.alignment import Alignments, JointResult, Prediction
+from agalign.values.alignment import Alignment, Alignments, JointResult, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
+from agalign.values.issues import INACCURATE
 from agalign.values.lens_shapes import variance_px2
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
@@ -125,20 +126,35 @@ def observation(
     return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion)
 
 
-def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
-    """Return the aligned mappings of a capture as an observation of the rig, without what they contain of it."""
+def is_inaccurate(alignment: Alignment) -> bool:
+    """Return True for a mapping that the windows of the images confirm, but not accurately enough."""
+    is_by_windows = alignment.prediction is not None and alignment.prediction.source == "windows"
+    return is_by_windows and {issue.kind for issue in alignment.issues} == {INACCURATE}
+
+
+def observed(
+    pairs: Sequence[BandPair], result: Alignments, capture: Capture, *, with_inaccurate: bool = False
+) -> Observation:
+    """Return the aligned mappings of a capture as an observation of the rig, without what they contain of it.
+
+    The covariance of inaccurate ones is too small: their standard errors are those of the whole mapping, which contain
+    the shifts of held-out windows.
+    """
     known = {
         name: a.joint.by_images or replace(a.joint, fixed_to_moving=a.fixed_to_moving)
         for name, a in result.items()
-        if a.status == "aligned" and a.joint is not None
+        if a.joint is not None and (a.status == "aligned" or (with_inaccurate and is_inaccurate(a)))
     }
-    parallax_px = {}
-    for pair in pairs:
-        parallax = result[pair.name].mapping.parallax if pair.name in known else None
-        if parallax is not None:
+    of_images = observation(pairs, known, capture)
+    std_px, parallax_px = dict(of_images.std_px), dict[str, float]()
+    for pair in (p for p in pairs if p.name in of_images.mappings):
+        alignment = result[pair.name]
+        if is_inaccurate(alignment):
+            std_px[pair.name] = max(std_px[pair.name], pair.in_reference_file_px(alignment.std_px))
+        if (parallax := alignment.mapping.parallax) is not None:
             rms_px = parallax.relief.rms_px * math.hypot(*parallax.baseline)
             parallax_px[pair.name] = pair.in_reference_file_px(rms_px)
-    return replace(observation(pairs, known, capture), parallax_px=parallax_px)
+    return replace(of_images, std_px=std_px, parallax_px=parallax_px)
 
 
 def rig_prediction(pair: BandPair, rig: Rig, known: Observation) -> RigPrediction:

@@ -15,6 +15,7 @@ import agalign
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import quiet
 from agalign.batch.flight_learning import learn_flight
+from agalign.batch.learning_tasks import LearningCapture
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import CaptureEstimation, align_capture_bands, bands_to_learn
 from agalign.capture.band_pair import BandPair, read_pairs
@@ -29,7 +30,7 @@ from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, Seed
 from agalign.values.capture import Capture
-from agalign.values.issues import CLOSE_WINDOWS, RETRIEVAL, Issue
+from agalign.values.issues import CLOSE_WINDOWS, INACCURATE, RETRIEVAL, Issue
 from agalign.values.mapping_error import MappingError
 
 from ..conftest import Shared, read_json
@@ -241,6 +242,26 @@ def test_bands_are_predicted_from_others_without_what_these_contain_of_the_rig(f
     known = observed(first.pairs, with_rig, first.capture)
     scales = first.estimation.bands["NIR"].pair.scales
     np.testing.assert_allclose(known.mappings["NIR"], scales.between_files(moved))
+
+
+def test_a_rig_is_learned_from_inaccurate_bands_too(first: Estimated) -> None:
+    """Their standard errors contain the shifts of their windows; nothing is predicted from such a band."""
+    nir, pair = first.estimation.decided()["NIR"], first.estimation.bands["NIR"].pair
+    known = observed(first.pairs, first.estimation.decided(), first.capture)
+    inaccurate, misaligned = Issue(INACCURATE, 0.2, 0.1, "0.5 px"), Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px")
+    for issues, is_learned in (((inaccurate,), True), ((inaccurate, misaligned), False)):
+        error = replace(nir.error, rig_std_px=0.7)
+        of_windows = Candidate(pair, nir.mapping, error, nir.residual, nir.joint, given_issues=issues)
+        estimation = replace(first.with_nir(of_windows).estimation, reliefs=[])
+        learned_from = LearningCapture.of(first.capture, estimation)
+        assert learned_from.aligned == {"Red"}
+        bands = {"Red", "NIR"} if is_learned else {"Red"}
+        assert set(learned_from.residuals) == set(learned_from.observation.mappings) == bands
+        assert not learned_from.is_aligned
+        assert observed(first.pairs, estimation.decided(), first.capture).mappings.keys() == {"Red"}
+        if is_learned:
+            std_px = pair.in_reference_file_px(estimation.decided()["NIR"].std_px)
+            assert learned_from.observation.std_px["NIR"] == std_px > 0.7 > 3 * known.std_px["NIR"]
 
 
 @pytest.mark.parametrize("off_px", [8.0, 25.0])
