@@ -11,7 +11,7 @@ import numpy as np
 from agalign.batch.capture_task import quiet
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_rig import is_inaccurate, observed
+from agalign.capture.by_rig import observed
 from agalign.capture.candidate import BandCandidates
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import Settings
@@ -75,8 +75,7 @@ class LearningCapture:
     aligned: frozenset[str]
     """The aligned bands."""
     observation: Observation
-    """The mappings of the aligned bands for the rig, and inaccurate ones: the captures of a flight together are more
-    accurate than each of them."""
+    """The mappings for the rig, also inaccurate ones: together, the captures of a flight are more accurate."""
     residuals: Mapping[str, Residual]
     """Shifts of windows under these mappings, px of the files."""
     is_aligned: bool
@@ -86,14 +85,12 @@ class LearningCapture:
     def of(cls, capture: Capture, estimation: CaptureEstimation) -> "LearningCapture":
         """Collect the results for the pairs of a capture."""
         result, pairs = estimation.decided(), estimation.pairs
+        aligned = frozenset(name for name, alignment in result.items() if alignment.status == "aligned")
+        observation = observed(pairs, result, capture)
         in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
         residuals = {
-            name: a.residual
-            for name, a in in_file_px.items()
-            if a.residual is not None and (a.status == "aligned" or is_inaccurate(a))
+            b: a.residual for b, a in in_file_px.items() if b in observation.mappings and a.residual is not None
         }
-        aligned = frozenset(name for name in residuals if result[name].status == "aligned")
-        observation = observed(pairs, result, capture, with_inaccurate=True)
         refined = {
             name: RefinedPair(band.found, joint, band.pair.scales.between_files(joint.fixed_to_moving))
             for name, band in estimation.bands.items()

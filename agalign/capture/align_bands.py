@@ -247,7 +247,7 @@ class CaptureEstimation:
         return self.decided()
 
     def _predictions(self, result: Alignments, capture: Capture) -> dict[str, RigPrediction]:
-        """Return the predictions of the rig of the flight from the aligned bands of the capture."""
+        """Return the predictions of the bands by the rig of the flight and the other bands of the capture."""
         rig = None if self.model is None else self.model.rig
         return {} if rig is None else rig_predictions(self.pairs, result, rig, capture)
 

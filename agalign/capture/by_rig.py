@@ -126,16 +126,14 @@ def observation(
     return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion)
 
 
-def is_inaccurate(alignment: Alignment) -> bool:
+def _is_inaccurate(alignment: Alignment) -> bool:
     """Return True for a mapping that the windows of the images confirm, but not accurately enough."""
     is_by_windows = alignment.prediction is not None and alignment.prediction.source == "windows"
     return is_by_windows and {issue.kind for issue in alignment.issues} == {INACCURATE}
 
 
-def observed(
-    pairs: Sequence[BandPair], result: Alignments, capture: Capture, *, with_inaccurate: bool = False
-) -> Observation:
-    """Return the aligned mappings of a capture as an observation of the rig, without what they contain of it.
+def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
+    """Return the mappings of a capture by its images as an observation of the rig, without what they contain of it.
 
     The covariance of inaccurate ones is too small: their standard errors are those of the whole mapping, which contain
     the shifts of held-out windows.
@@ -143,13 +141,13 @@ def observed(
     known = {
         name: a.joint.by_images or replace(a.joint, fixed_to_moving=a.fixed_to_moving)
         for name, a in result.items()
-        if a.joint is not None and (a.status == "aligned" or (with_inaccurate and is_inaccurate(a)))
+        if a.joint is not None and (a.status == "aligned" or _is_inaccurate(a))
     }
     of_images = observation(pairs, known, capture)
     std_px, parallax_px = dict(of_images.std_px), dict[str, float]()
     for pair in (p for p in pairs if p.name in of_images.mappings):
         alignment = result[pair.name]
-        if is_inaccurate(alignment):
+        if _is_inaccurate(alignment):
             std_px[pair.name] = max(std_px[pair.name], pair.in_reference_file_px(alignment.std_px))
         if (parallax := alignment.mapping.parallax) is not None:
             rms_px = parallax.relief.rms_px * math.hypot(*parallax.baseline)
@@ -165,7 +163,7 @@ def rig_prediction(pair: BandPair, rig: Rig, known: Observation) -> RigPredictio
 def rig_predictions(
     pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture
 ) -> dict[str, RigPrediction]:
-    """Return the prediction of each band of the rig from the other aligned bands of a capture, with its relief."""
+    """Return the prediction of each band of the rig from the other bands of a capture, with its relief."""
     known = observed(pairs, result, capture)
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]

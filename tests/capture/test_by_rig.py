@@ -245,7 +245,7 @@ def test_bands_are_predicted_from_others_without_what_these_contain_of_the_rig(f
 
 
 def test_a_rig_is_learned_from_inaccurate_bands_too(first: Estimated) -> None:
-    """Their standard errors contain the shifts of their windows; nothing is predicted from such a band."""
+    """Their standard errors contain the shifts of their windows."""
     nir, pair = first.estimation.decided()["NIR"], first.estimation.bands["NIR"].pair
     known = observed(first.pairs, first.estimation.decided(), first.capture)
     inaccurate, misaligned = Issue(INACCURATE, 0.2, 0.1, "0.5 px"), Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px")
@@ -258,7 +258,6 @@ def test_a_rig_is_learned_from_inaccurate_bands_too(first: Estimated) -> None:
         bands = {"Red", "NIR"} if is_learned else {"Red"}
         assert set(learned_from.residuals) == set(learned_from.observation.mappings) == bands
         assert not learned_from.is_aligned
-        assert observed(first.pairs, estimation.decided(), first.capture).mappings.keys() == {"Red"}
         if is_learned:
             std_px = pair.in_reference_file_px(estimation.decided()["NIR"].std_px)
             assert learned_from.observation.std_px["NIR"] == std_px > 0.7 > 3 * known.std_px["NIR"]
