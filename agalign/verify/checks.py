@@ -41,6 +41,9 @@ MAX_UNEXPECTED_PX = 3.0
 """Distance from the prediction by the rig, px of the moving file, that is always accepted, as relief may cause it."""
 MAX_ALIAS_PEAK = 0.75
 """Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
+_MIN_ALIAS_SIGMA = 5.0
+"""Height of such a peak in standard deviations. Noise far from the result reaches 4.5; the result of a thermal band may
+have 18, a quarter of which is the height of a scene that repeats three times."""
 
 _MIN_COMMON_COVERAGE = 0.3
 """Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
@@ -285,7 +288,8 @@ def alias_peaks(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) ->
     They are of images that are reduced by `scale`. Without a peak at zero shift, the highest one is returned.
     """
     height, width = fixed.shape
-    surface = np.fft.fftshift(correlation_surfaces(fixed, moving)) / _height_of_repetition(height, width)
+    correlation = np.fft.fftshift(correlation_surfaces(fixed, moving))
+    surface = correlation / _height_of_repetition(height, width)
     row, column = height // 2, width // 2
     radius_px = 3  # of a correlation peak
     centre = np.s_[row - radius_px : row + radius_px + 1, column - radius_px : column + radius_px + 1]
@@ -293,7 +297,8 @@ def alias_peaks(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) ->
     surface[centre] = -np.inf
     ratios = surface / centre_peak if centre_peak > 0 else np.where(surface == surface.max(), np.inf, 0.0)
     is_highest = surface == cv2.dilate(surface, np.ones((2 * radius_px + 1,) * 2, np.uint8))
-    rows, columns = np.nonzero(is_highest & (ratios > MAX_ALIAS_PEAK))
+    is_noise = correlation < _MIN_ALIAS_SIGMA * correlation.std()
+    rows, columns = np.nonzero(is_highest & (ratios > MAX_ALIAS_PEAK) & ~is_noise)
     found = zip((columns - column) / scale.x, (rows - row) / scale.y, ratios[rows, columns], strict=True)
     return sorted((AliasPeak((float(x), float(y)), float(ratio)) for x, y, ratio in found), key=lambda a: -a.ratio)
 

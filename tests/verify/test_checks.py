@@ -8,7 +8,7 @@ import pytest
 
 import agalign
 from agalign.fit.windows import FixedWindows, centred_correlation
-from agalign.pixels.structure import structure_field, windowed_spectra
+from agalign.pixels.structure import correlation_surfaces, structure_field, windowed_spectra
 from agalign.values import geometry, issues
 from agalign.values.alignment import JointResult, Prediction
 from agalign.values.geometry import Points
@@ -343,6 +343,18 @@ def test_a_scene_that_repeats_across_a_third_of_the_image_is_repetitive() -> Non
     assert {-80.0, 80.0} <= {peak.shift_px[0] for peak in alias_peaks(fixed, moving)}
     once = windowed_spectra(structure_field(whole(textured_image(240, 240, 1))))
     assert alias_peaks(once, once) == []
+
+
+def test_noise_where_images_overlap_little_is_no_repetition() -> None:
+    """As of a thermal band: the peak of the result is low, and that of a repetition would be a quarter of it."""
+    rng, scene = np.random.default_rng(0), textured_image(320, 240, 1).astype(np.float32)
+    fixed, moving = (
+        windowed_spectra(structure_field(whole(np.float32(scene + 1.5 * scene.std() * rng.normal(size=scene.shape)))))
+        for _ in "fm"
+    )
+    surface = correlation_surfaces(fixed, moving)
+    assert 15 < surface.max() / surface.std() < 25
+    assert alias_peaks(fixed, moving) == []
 
 
 def layer_in(moving: np.ndarray) -> Layer | None:
