@@ -203,6 +203,7 @@ def test_the_error_of_a_band_with_larger_pixels_is_shown_in_px_of_both(tmp_path:
         *[("0.071", ""), ("0.071", "")],
         *[("12.550", ""), ("12.550", " (0.88 px of the band)")],
     ]
+    assert '<th scope="col" class="n"' in page
     rows = {row["band"]: row for row in table_in(tmp_path / "summary.csv")}
     names = "expected_error_px", "expected_error_band_px"
     assert [[rows[band][name] for name in names] for band in ("NIR", "LWIR")] == [
