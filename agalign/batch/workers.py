@@ -15,7 +15,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -40,6 +40,7 @@ from agalign.values.choices import MAX_JOBS
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 1.0
 """Interval at which the loss of workers is checked while no task completes. On Windows, SIGINT waits as long."""
+_NO_WORKER = "agalign: no worker is connected to the Dask scheduler; the run waits for one"
 _CAPTURES_WORTH_A_PROCESS = 2
 """Minimum number of captures per process: starting one takes the time of one capture, while a flight is learned."""
 MAX_THREADS = 4
@@ -129,7 +130,8 @@ def on_executor(executor: "Executor | ProcessPool") -> RunTasks:
 
     def run_tasks(function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None) -> Completed[R]:
         if isinstance(executor, (ProcessPool, DaskExecutor)):
-            return _completed(partial(executor.submit, function, timeout_s=timeout_s), tasks, lambda: executor.loss)
+            loss = executor.checked_loss if isinstance(executor, DaskExecutor) else lambda: executor.loss
+            return _completed(partial(executor.submit, function, timeout_s=timeout_s), tasks, loss)
         return _completed(partial(_submitted, executor, function), tasks, str)
 
     return run_tasks
@@ -309,8 +311,7 @@ def _check_versions(client: Any) -> None:
     # A built-in function, because a worker without agalign cannot unpickle one of this package.
     versions = client.run(eval, "__import__('agalign._version', fromlist=['_']).__version__", on_error="return")
     if not versions:
-        text = "agalign: no worker is connected to the Dask scheduler; the run waits for one"
-        logging.getLogger(__name__).warning(text)
+        logging.getLogger(__name__).warning(_NO_WORKER)
     for worker, version in sorted(versions.items()):
         if version != __version__:
             problem = f"cannot load agalign ({version})" if isinstance(version, Exception) else f"has agalign {version}"
@@ -322,6 +323,7 @@ class DaskExecutor(Executor):
 
     def __init__(self, client: Any) -> None:
         self._client, self._executor = client, client.get_executor(pure=False)
+        self._has_workers = bool(client.ncores())
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
         return self._executor.submit(_on_worker, __version__, function, *arguments, **named)
@@ -346,6 +348,15 @@ class DaskExecutor(Executor):
             "the Dask scheduler does not answer any more; finished captures are kept, and the same command resumes "
             "the run"
         )
+
+    def checked_loss(self) -> str:
+        """Return the `loss`; log a warning if the last worker is gone, as the tasks wait for another one."""
+        if not self.loss:
+            with suppress(Exception):  # Dask's, of many classes, if the scheduler is lost now
+                had_workers, self._has_workers = self._has_workers, bool(self._client.ncores())
+                if had_workers and not self._has_workers:
+                    logging.getLogger(__name__).warning(_NO_WORKER)
+        return self.loss
 
 
 def _missing(paths: Sequence[Path]) -> Path | None:

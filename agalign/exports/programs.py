@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -114,19 +114,26 @@ def _changed_band_file(capture: RunCapture, out: Path) -> str:
 def _complete_folder(target: Path) -> Iterator[Path]:
     """Yield a hidden folder in an empty or new `target`. If the block succeeds, its contents move to `target`.
 
-    An export that is killed leaves nothing else, and the next one removes it. Raises OutputError.
+    An export that is killed leaves nothing else, and the next one removes it; one that fails leaves no new folder.
+    Raises OutputError.
     """
     remove_partial_files(target, below=False)
-    with scratch_file(target / "README.txt") as folder:
-        if any(target.iterdir()):
-            raise OutputError(f"{target}: is not empty; choose another folder with -o, or delete it")
-        try:
-            yield folder
-        except (OSError, OutputError) as error:
-            reason = f"{target}: cannot be written ({error.strerror})" if isinstance(error, OSError) else str(error)
-            raise OutputError(reason.replace(str(folder), str(target))) from None
-        for path in sorted(folder.iterdir()):
-            path.rename(target / path.name)
+    is_new = not target.exists()
+    try:
+        with scratch_file(target / "README.txt") as folder:
+            if any(target.iterdir()):
+                raise OutputError(f"{target}: is not empty; choose another folder with -o, or delete it")
+            try:
+                yield folder
+            except (OSError, OutputError) as error:
+                reason = f"{target}: cannot be written ({error.strerror})" if isinstance(error, OSError) else str(error)
+                raise OutputError(reason.replace(str(folder), str(target))) from None
+            for path in sorted(folder.iterdir()):
+                path.rename(target / path.name)
+    finally:
+        if is_new:
+            with suppress(OSError):  # not empty
+                target.rmdir()
 
 
 def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy: bool) -> None:

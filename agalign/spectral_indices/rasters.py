@@ -5,6 +5,7 @@
 import glob
 import json
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -32,7 +33,7 @@ from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.before_alignment import index_before
 from agalign.spectral_indices.formulas import Index, bands_for, chosen_indices, compute, index_named, index_of_formula
 from agalign.spectral_indices.picture import write_picture
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.fields import equal
 from agalign.values.image import Tile
 from agalign.values.radiometry import are_raw_numbers
@@ -202,10 +203,15 @@ class IndexRasters(Product):
 
 
 def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
-    """Raise ConfigurationError for an unknown or repeated index, or one that no capture has the bands or unit for."""
+    """Raise ConfigurationError for an unknown or repeated index, or one that no camera has the bands for, or no capture
+    the unit.
+    """
+    of_cameras = defaultdict[CameraIdentity, list[Band]](list)  # single captures may lack files
+    for capture in captures:
+        of_cameras[capture.camera] += capture.bands
     for index in chosen_indices(settings.indices):
         suitable = [c for c in captures if _has_bands(c.bands, index)]
-        if captures and not suitable:
+        if captures and not any(_has_bands(bands, index) for bands in of_cameras.values()):
             names = ", ".join(dict.fromkeys(b.name for c in captures for b in c.bands))
             raise ConfigurationError(
                 f"--index {index.name}: needs bands {', '.join(index.roles)}, and no capture has them all; "

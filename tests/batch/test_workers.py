@@ -209,8 +209,14 @@ def test_a_dask_worker_without_the_folders_ends_the_run_before_it_begins(flight:
 
 
 def test_a_dask_scheduler_without_workers_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    waits = "agalign: no worker is connected to the Dask scheduler; the run waits for one"
     workers._check_versions(client({}))
-    assert caplog.messages == ["agalign: no worker is connected to the Dask scheduler; the run waits for one"]
+    assert caplog.messages == [waits]
+    of_cluster = client({})
+    of_cluster.ncores.side_effect = {"tcp://a:1": 1}, {"tcp://a:1": 1}, {}, {}, {"tcp://b:1": 1}, OSError, {}
+    executor = DaskExecutor(of_cluster)
+    assert {executor.checked_loss() for _ in range(6)} == {""}
+    assert caplog.messages == [waits] * 3, "when the last worker is gone, once each time"
 
 
 @pytest.mark.parametrize("ends", [True, False])

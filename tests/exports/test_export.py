@@ -112,3 +112,4 @@ def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path
     ):
         with pytest.raises(error, match=message):
             export(out, tmp_path / target, program)
+    assert not (tmp_path / "to").exists(), "an export that is refused leaves no folder"

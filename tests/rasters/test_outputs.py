@@ -18,6 +18,7 @@ from agalign.rasters.aligned_files import band_file_names
 from agalign.rasters.band_reader import RAW, UNSTATED, BandReader
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar_file import verify_outputs
+from agalign.spectral_indices.rasters import check_indices
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
@@ -162,6 +163,16 @@ def test_an_index_of_bands_in_different_units_is_a_problem_of_every_run_and_no_d
 def test_an_index_that_no_capture_can_have_is_refused_first(tmp_path: Path, index: str, problem: str) -> None:
     with pytest.raises(agalign.ConfigurationError, match=problem):
         written(tmp_path, agalign.Settings(write=agalign.WriteSettings(indices=(index,))))
+
+
+def test_captures_that_lack_a_file_each_do_not_exclude_the_index_of_their_camera(tmp_path: Path) -> None:
+    for name in ("1_green", "1_red", "2_green", "2_nir"):
+        write_band(tmp_path / f"{name}.tif", np.full((64, 80), 3000, np.uint16))
+    captures = agalign.discover(tmp_path).captures
+    assert [[b.name for b in c.bands] for c in captures] == [["green", "red"], ["green", "nir"]]
+    check_indices(captures, agalign.WriteSettings(indices=("ndvi",)))
+    with pytest.raises(agalign.ConfigurationError, match=r"no capture has them all; there are green, red$"):
+        check_indices(captures[:1], agalign.WriteSettings(indices=("ndvi",)))
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-4])
