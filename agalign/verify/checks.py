@@ -297,7 +297,7 @@ def alias_peaks(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) ->
     surface[centre] = -np.inf
     ratios = surface / centre_peak if centre_peak > 0 else np.where(surface == surface.max(), np.inf, 0.0)
     is_highest = surface == cv2.dilate(surface, np.ones((2 * radius_px + 1,) * 2, np.uint8))
-    is_noise = correlation < _MIN_ALIAS_SIGMA * correlation.std()
+    is_noise = (correlation < _MIN_ALIAS_SIGMA * correlation.std()) & (centre_peak > 0)
     rows, columns = np.nonzero(is_highest & (ratios > MAX_ALIAS_PEAK) & ~is_noise)
     found = zip((columns - column) / scale.x, (rows - row) / scale.y, ratios[rows, columns], strict=True)
     return sorted((AliasPeak((float(x), float(y)), float(ratio)) for x, y, ratio in found), key=lambda a: -a.ratio)

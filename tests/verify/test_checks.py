@@ -1,5 +1,6 @@
 """The checks: each finds its issue, alone and at its limit, and issues decide the status."""
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -355,6 +356,15 @@ def test_noise_where_images_overlap_little_is_no_repetition() -> None:
     surface = correlation_surfaces(fixed, moving)
     assert 15 < surface.max() / surface.std() < 25
     assert alias_peaks(fixed, moving) == []
+
+
+def test_without_a_peak_of_the_result_the_highest_one_counts_however_low(monkeypatch: pytest.MonkeyPatch) -> None:
+    surface = np.random.default_rng(0).uniform(0.0, 0.1, (40, 60)).astype(np.float32)
+    surface[16:25, 26:35] = -1.0
+    surface[5, 40] = 0.15
+    monkeypatch.setattr(checks, "correlation_surfaces", lambda *_: np.fft.ifftshift(surface))
+    (alias,) = alias_peaks(np.ones((40, 60), np.complex64), np.ones((40, 60), np.complex64))
+    assert math.isinf(alias.ratio)
 
 
 def layer_in(moving: np.ndarray) -> Layer | None:
